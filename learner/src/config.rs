@@ -1,0 +1,278 @@
+//! The settings of training. Defaults are *Learning to Get Up*, Table 1.
+
+use getup_policy::{Body, PolicyShape};
+use serde::{Deserialize, Serialize};
+
+/// A setting that cannot be used: which, its value, and what it may be.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("{key} = {value}: {wanted}")]
+pub struct ConfigError {
+    /// The setting's name, as in the configuration file.
+    pub key: &'static str,
+    /// What it is set to.
+    pub value: String,
+    /// What it may be.
+    pub wanted: &'static str,
+}
+
+fn check(good: bool, key: &'static str, value: &dyn ToString, wanted: &'static str) -> Result<(), ConfigError> {
+    if good { Ok(()) } else { Err(ConfigError { key, value: value.to_string(), wanted }) }
+}
+
+/// Soft actor-critic (App. D, Table 1).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SacConfig {
+    /// Widths of the hidden layers of the actor and of every critic.
+    pub hidden: Vec<usize>,
+    /// Number of critics; the target is the minimum over them.
+    pub critics: usize,
+    /// Transitions of a minibatch.
+    pub batch: usize,
+    /// Discount a step, γ.
+    pub gamma: f64,
+    /// Steps whose rewards are summed before the critic is asked.
+    pub n_step: usize,
+    /// Share of the new weights in the target critics at every update, τ.
+    pub tau: f64,
+    /// Adam's learning rate of the actor.
+    pub actor_lr: f64,
+    /// Adam's learning rate of the critics.
+    pub critic_lr: f64,
+    /// Adam's learning rate of the temperature's logarithm.
+    pub temperature_lr: f64,
+    /// The temperature at the start, α.
+    pub initial_temperature: f64,
+    /// The entropy that the temperature is steered to, in nats; `auto` is −(numbers in an action).
+    pub target_entropy: TargetEntropy,
+    /// Updates for every env step; the rate limiter keeps it.
+    pub updates_per_step: f64,
+    /// Env steps of uniform actions before the first update.
+    pub uniform_steps: u64,
+    /// Whether observations are normalised by running statistics.
+    pub normalize_observations: bool,
+    /// Env steps after which those statistics no longer change.
+    pub normalize_until: u64,
+}
+
+/// See [`SacConfig::target_entropy`].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum TargetEntropy {
+    /// In nats.
+    Nats(f64),
+    /// −(numbers in an action).
+    Auto(Auto),
+}
+
+/// The word `auto` in a configuration file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Auto {
+    /// Chosen by the program.
+    Auto,
+}
+
+impl TargetEntropy {
+    /// The entropy for actions of `width` numbers.
+    pub fn nats(self, width: usize) -> f64 {
+        match self {
+            Self::Nats(nats) => nats,
+            Self::Auto(_) => -(width as f64),
+        }
+    }
+}
+
+impl Default for SacConfig {
+    fn default() -> Self {
+        Self {
+            hidden: vec![1024, 1024],
+            critics: 2,
+            batch: 1024,
+            gamma: 0.97,
+            n_step: 1,
+            tau: 0.005,
+            actor_lr: 1e-5,
+            critic_lr: 1e-4,
+            temperature_lr: 1e-4,
+            initial_temperature: 0.1,
+            target_entropy: TargetEntropy::Auto(Auto::Auto),
+            updates_per_step: 1.0,
+            uniform_steps: 10_000,
+            normalize_observations: false,
+            normalize_until: 300_000,
+        }
+    }
+}
+
+impl SacConfig {
+    /// Refuses settings that cannot train.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let sizes = !self.hidden.is_empty() && self.hidden.iter().all(|width| (1..=16_384).contains(width));
+        check(sizes, "sac.hidden", &format!("{:?}", self.hidden), "one or more widths from 1 to 16384")?;
+        check((1..=16).contains(&self.critics), "sac.critics", &self.critics, "from 1 to 16")?;
+        check((1..=65_536).contains(&self.batch), "sac.batch", &self.batch, "from 1 to 65536")?;
+        check((0.0..1.0).contains(&self.gamma), "sac.gamma", &self.gamma, "at least 0 and under 1")?;
+        check((1..=64).contains(&self.n_step), "sac.n_step", &self.n_step, "from 1 to 64")?;
+        check(self.tau > 0.0 && self.tau <= 1.0, "sac.tau", &self.tau, "over 0, at most 1")?;
+        for (key, rate) in [
+            ("sac.actor_lr", self.actor_lr),
+            ("sac.critic_lr", self.critic_lr),
+            ("sac.temperature_lr", self.temperature_lr),
+        ] {
+            check((0.0..=1.0).contains(&rate), key, &rate, "from 0 to 1")?;
+        }
+        let alpha = self.initial_temperature;
+        check(alpha > 0.0 && alpha.is_finite(), "sac.initial_temperature", &alpha, "over 0")?;
+        let entropy = self.target_entropy.nats(1);
+        check(entropy.is_finite(), "sac.target_entropy", &entropy, "a number of nats, or \"auto\"")?;
+        let rate = self.updates_per_step;
+        check(rate > 0.0 && rate <= 100.0, "sac.updates_per_step", &rate, "over 0, at most 100")
+    }
+
+    /// The actor's shape for a task.
+    pub fn policy_shape(&self, observation: usize, action: usize) -> PolicyShape {
+        PolicyShape { observation, action, body: Body::Mlp { hidden: self.hidden.clone() } }
+    }
+}
+
+/// The strong-to-weak torque curriculum (§5, Algorithm 1).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CurriculumConfig {
+    /// β of stage 0, the upper clip of β̂, and the actuators' clamp where above 1.
+    pub beta_start: f64,
+    /// β never goes under it.
+    pub beta_floor: f64,
+    /// β^{i+1} / β^i.
+    pub decay: f64,
+    /// Standard deviation of an episode's β̂ around β^i.
+    pub beta_std: f64,
+    /// An evaluation whose minimum return exceeds it passes the stage, ω.
+    pub omega: f64,
+    /// Bounds of the env steps that a stage after the first may last.
+    pub n_min: u64,
+    /// See `n_min`.
+    pub n_max: u64,
+}
+
+impl Default for CurriculumConfig {
+    fn default() -> Self {
+        Self {
+            beta_start: 1.0,
+            beta_floor: 0.4,
+            decay: 0.95,
+            beta_std: 0.04,
+            omega: 60.0,
+            n_min: 300_000,
+            n_max: 800_000,
+        }
+    }
+}
+
+impl CurriculumConfig {
+    /// Refuses settings under which the curriculum has no meaning.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let floor = self.beta_floor;
+        check(floor > 0.0 && floor <= 1.0, "curriculum.beta_floor", &floor, "over 0, at most 1")?;
+        let start = self.beta_start;
+        let good = start >= floor && start <= 4.0;
+        check(good, "curriculum.beta_start", &start, "from curriculum.beta_floor to 4")?;
+        check(self.decay > 0.0 && self.decay < 1.0, "curriculum.decay", &self.decay, "between 0 and 1")?;
+        check((0.0..=1.0).contains(&self.beta_std), "curriculum.beta_std", &self.beta_std, "from 0 to 1")?;
+        check(self.omega.is_finite(), "curriculum.omega", &self.omega, "a number")?;
+        check(self.n_min > 0, "curriculum.n_min", &self.n_min, "at least 1")?;
+        check(self.n_min <= self.n_max, "curriculum.n_min", &self.n_min, "at most curriculum.n_max")
+    }
+}
+
+/// When and how policies are evaluated.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct EvaluationConfig {
+    /// Env steps from one evaluation to the next.
+    pub every: u64,
+    /// Fallen states of an evaluation, drawn once from the run's seed.
+    pub episodes: usize,
+    /// A lease whose holder is silent this long goes to another actor, in seconds.
+    pub lease_seconds: f64,
+}
+
+impl Default for EvaluationConfig {
+    fn default() -> Self {
+        Self { every: 20_000, episodes: 10, lease_seconds: 10.0 }
+    }
+}
+
+impl EvaluationConfig {
+    /// Refuses settings under which nothing would be evaluated.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check(self.every > 0, "evaluation.every", &self.every, "at least 1")?;
+        check((1..=10_000).contains(&self.episodes), "evaluation.episodes", &self.episodes, "from 1 to 10000")?;
+        let seconds = self.lease_seconds;
+        check((1.0..=3600.0).contains(&seconds), "evaluation.lease_seconds", &seconds, "from 1 to 3600")
+    }
+}
+
+/// The learner as a process.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LearnerConfig {
+    /// `cpu`, or `cuda` for the first NVIDIA device.
+    pub device: Device,
+    /// Threads of the matrix products; 0 leaves one core to the rest and takes the others.
+    pub threads: usize,
+    /// Updates from one broadcast of the policy to the next.
+    pub publish_every: u64,
+    /// Seconds from one checkpoint to the next; one is also written at every promotion and at the end.
+    pub checkpoint_seconds: f64,
+    /// Checkpoints that are kept.
+    pub checkpoints_kept: usize,
+}
+
+/// Where the networks live.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Device {
+    /// The processor.
+    Cpu,
+    /// The first NVIDIA device.
+    Cuda,
+}
+
+impl std::str::FromStr for Device {
+    type Err = ConfigError;
+
+    fn from_str(text: &str) -> Result<Self, ConfigError> {
+        match text {
+            "cpu" => Ok(Self::Cpu),
+            "cuda" => Ok(Self::Cuda),
+            _ => {
+                Err(ConfigError { key: "learner.device", value: text.to_owned(), wanted: "\"cpu\" or \"cuda\"" })
+            }
+        }
+    }
+}
+
+impl Default for LearnerConfig {
+    fn default() -> Self {
+        Self { device: Device::Cpu, threads: 0, publish_every: 20, checkpoint_seconds: 60.0, checkpoints_kept: 3 }
+    }
+}
+
+impl LearnerConfig {
+    /// Refuses settings that cannot run.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check(self.threads <= 1024, "learner.threads", &self.threads, "from 0 (automatic) to 1024")?;
+        check(self.publish_every > 0, "learner.publish_every", &self.publish_every, "at least 1")?;
+        let seconds = self.checkpoint_seconds;
+        check(seconds > 0.0, "learner.checkpoint_seconds", &seconds, "over 0")?;
+        check(self.checkpoints_kept > 0, "learner.checkpoints_kept", &self.checkpoints_kept, "at least 1")
+    }
+
+    /// Threads of the matrix products on this machine.
+    pub fn effective_threads(&self) -> usize {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        if self.threads == 0 { cores.saturating_sub(1).max(1) } else { self.threads }
+    }
+}

@@ -1,0 +1,94 @@
+//! What a network looks like: its layers, in order, with the names of their tensors.
+//!
+//! The learner's network and the actor's forward pass are both built from [`PolicyShape::layers`].
+
+use serde::{Deserialize, Serialize};
+
+/// The log standard deviation is squashed by a tanh into this range (App. D).
+pub const LOG_STD_MIN: f32 = -5.0;
+/// See [`LOG_STD_MIN`].
+pub const LOG_STD_MAX: f32 = 2.0;
+
+/// The layers between the observation and the heads.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Body {
+    /// Fully connected layers with a ReLU after each.
+    Mlp {
+        /// Widths of the hidden layers.
+        hidden: Vec<usize>,
+    },
+}
+
+/// The shape of a squashed Gaussian policy: observation → body → mean and log standard deviation.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PolicyShape {
+    /// Numbers in an observation.
+    pub observation: usize,
+    /// Numbers in an action.
+    pub action: usize,
+    /// The layers between.
+    pub body: Body,
+}
+
+/// One fully connected layer, `y = W x + b`, with `W` of shape `[outputs, inputs]`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Linear {
+    /// The stem of its tensors' names: `<name>.weight`, `<name>.bias`.
+    pub name: String,
+    /// Width of what it reads.
+    pub inputs: usize,
+    /// Width of what it gives.
+    pub outputs: usize,
+}
+
+impl Linear {
+    fn new(name: String, inputs: usize, outputs: usize) -> Self {
+        Self { name, inputs, outputs }
+    }
+}
+
+impl Body {
+    /// The body's layers for an input of width `inputs`, in order.
+    pub fn layers(&self, inputs: usize) -> Vec<Linear> {
+        let Body::Mlp { hidden } = self;
+        let widths = std::iter::once(&inputs).chain(hidden);
+        widths
+            .zip(hidden)
+            .enumerate()
+            .map(|(index, (&from, &to))| Linear::new(format!("body.{index}"), from, to))
+            .collect()
+    }
+
+    /// Width of what the body gives to the heads.
+    pub fn output_width(&self, inputs: usize) -> usize {
+        let Body::Mlp { hidden } = self;
+        hidden.last().copied().unwrap_or(inputs)
+    }
+}
+
+impl PolicyShape {
+    /// All layers: the body's in order, then `head.mean` and `head.log_std`.
+    pub fn layers(&self) -> Vec<Linear> {
+        let mut layers = self.body.layers(self.observation);
+        let width = self.body.output_width(self.observation);
+        for head in ["head.mean", "head.log_std"] {
+            layers.push(Linear::new(head.to_owned(), width, self.action));
+        }
+        layers
+    }
+
+    /// Names and shapes of all tensors, in the order of [`PolicyShape::layers`].
+    pub fn tensors(&self) -> Vec<(String, Vec<usize>)> {
+        self.layers()
+            .into_iter()
+            .flat_map(|layer| {
+                [
+                    (format!("{}.weight", layer.name), vec![layer.outputs, layer.inputs]),
+                    (format!("{}.bias", layer.name), vec![layer.outputs]),
+                ]
+            })
+            .collect()
+    }
+}

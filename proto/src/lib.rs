@@ -1,0 +1,28 @@
+//! What passes between the roles: the messages, and the types they are parsed into at the door.
+//!
+//! - [`v1`] is generated from `getup/v1/*.proto`, which document the protocol itself: messages, clients, servers.
+//! - [`RunSpec`] names the columns of a run's transitions; [`Segment`] is a stretch of one episode that
+//!   follows it. Both are made from their wire form by `parse`, which refuses what is malformed and says why,
+//!   so that nothing behind the door checks again.
+//! - [`columns`] turns `f32` values into the little-endian bytes of a column, and back.
+//! - [`PolicyVersion`] orders the policies of a run.
+
+pub mod columns;
+mod segment;
+mod spec;
+mod version;
+
+pub use segment::{EpisodeEnd, Segment, SegmentError};
+pub use spec::{ColumnSpec, Rows, RunSpec, SpecError};
+pub use version::PolicyVersion;
+
+/// The largest message that clients and servers of this crate's services accept, in bytes.
+///
+/// gRPC's usual 4 MiB are too few: an update of a 2 × 1024 policy is larger, and so are large minibatches.
+pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
+
+/// Generated from the .proto files: messages, clients and servers.
+#[allow(missing_docs, unreachable_pub, clippy::all, rustdoc::all)]
+pub mod v1 {
+    tonic::include_proto!("getup.v1");
+}

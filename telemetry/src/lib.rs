@@ -1,0 +1,28 @@
+//! Logs, metrics, health and shutdown: what every role serves besides its work.
+//!
+//! | module | what it gives |
+//! | --- | --- |
+//! | [`logging`] | [`init_logging`]: structured logs, pretty for people or JSON for machines |
+//! | [`metrics`] | [`build_info`], and the [`Registry`] that every role's metrics register in |
+//! | [`http`] | [`serve_http`]: `GET /metrics` in Prometheus' text format |
+//! | [`health`](mod@health) | [`health()`]: the gRPC health service |
+//! | [`shutdown`] | [`Shutdown`]: the one thing that everything awaits to end |
+//! | [`waits`] | [`Waits`]: every wait has a reason that logs, metrics and `getup status` show |
+//! | [`backoff`] | [`Backoff`]: how long to pause before the next attempt |
+
+pub mod backoff;
+pub mod health;
+pub mod http;
+pub mod logging;
+pub mod metrics;
+pub mod shutdown;
+pub mod waits;
+
+pub use backoff::Backoff;
+pub use health::health;
+pub use http::serve_http;
+pub use logging::{LogFormat, LoggingError, init_logging};
+pub use metrics::build_info;
+pub use prometheus::{self, Registry};
+pub use shutdown::Shutdown;
+pub use waits::{Wait, WaitGuard, Waits};

@@ -1,0 +1,65 @@
+//! Train, test, check, bench: each a few cargo commands, all on the release profile, so that they share artefacts.
+
+use std::process::Command;
+
+use anyhow::{Context, Result, bail};
+
+use crate::native::{peers_python, root, run};
+
+fn cargo() -> Command {
+    let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    command.current_dir(root());
+    command
+}
+
+/// Builds and becomes `getup train`: its exit code, its signals, its terminal.
+pub(crate) fn train(arguments: &[String]) -> Result<()> {
+    run(cargo().args(["build", "--release", "--package", "getup"]))?;
+    let mut command = Command::new(root().join("target/release/getup"));
+    command.arg("train").args(arguments);
+    #[cfg(unix)]
+    {
+        use std::os::unix::process::CommandExt;
+        Err(command.exec()).context("cannot start getup")
+    }
+    #[cfg(not(unix))]
+    run(&mut command)
+}
+
+/// The tests; `full` adds the long forms, which read `GETUP_TEST_FULL`.
+pub(crate) fn test(full: bool) -> Result<()> {
+    let mut command = cargo();
+    command.args(["test", "--release", "--workspace"]);
+    if full {
+        command.env("GETUP_TEST_FULL", "1");
+    }
+    run(&mut command)
+}
+
+/// Format, clippy (with and without the learner) and documentation, all without a warning.
+pub(crate) fn check() -> Result<()> {
+    run(cargo().args(["fmt", "--all", "--check"]))?;
+    let clippy = ["clippy", "--release", "--all-targets"];
+    run(cargo().args(clippy).args(["--workspace", "--", "-D", "warnings"]))?;
+    run(cargo().args(clippy).args(["--package", "getup", "--no-default-features", "--", "-D", "warnings"]))?;
+    run(cargo()
+        .args(["doc", "--release", "--workspace", "--no-deps", "--document-private-items"])
+        .env("RUSTDOCFLAGS", "-D warnings"))
+}
+
+/// Runs `benches/NAME.rs`, which prints its table and writes `target/bench/NAME.json`.
+pub(crate) fn bench(name: &str) -> Result<()> {
+    let folder = root().join("benches");
+    if !folder.join(format!("{name}.rs")).is_file() {
+        let mut known: Vec<String> = std::fs::read_dir(&folder)
+            .context("cannot read benches/")?
+            .filter_map(|entry| entry.ok()?.path().file_stem()?.to_str().map(str::to_owned))
+            .collect();
+        known.sort();
+        known.dedup();
+        bail!("no benchmark {name:?}; there are: {}", known.join(", "));
+    }
+    run(cargo()
+        .args(["bench", "--package", "getup", "--bench", name])
+        .env("GETUP_PEERS_PYTHON", peers_python()))
+}
