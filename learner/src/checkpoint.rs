@@ -1,0 +1,359 @@
+//! Checkpoints: everything that a resumed learner needs to go on bit for bit, given the same minibatches.
+//!
+//! The file is safetensors: the flat buffers of actor, critics and targets with Adam's moments, and one metadata
+//! key `getup` with the rest as JSON. The replay is not part of it: it has its own store.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rand_chacha::ChaCha8Rng;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+use tch::Tensor;
+
+use crate::adam::ScalarAdam;
+use crate::curriculum::Curriculum;
+use crate::parameters::to_vec;
+use crate::run_folder::{FolderError, write_atomically};
+use crate::sac::Sac;
+use crate::statistics::RunningStatistics;
+
+const FORMAT: &str = "getup-checkpoint";
+/// The version of the file's format that this program writes, and the newest it reads.
+const VERSION: u32 = 1;
+
+/// Why a checkpoint cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckpointError {
+    /// The folder cannot be read or written.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
+    /// The file cannot be read.
+    #[error("cannot read the checkpoint {path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The file is damaged, or not a checkpoint.
+    #[error("the checkpoint {path} is not usable: {problem}; move it away to resume the one before it")]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// The file was written by a newer program.
+    #[error("the checkpoint {path} has format version {found}, this program reads up to {VERSION}: update getup")]
+    Version {
+        /// The file.
+        path: PathBuf,
+        /// Its version.
+        found: u64,
+    },
+    /// The networks of the configuration have another shape.
+    #[error(
+        "tensor {name:?} of the checkpoint has {found} numbers, the configured networks have {wanted}: resume \
+         with the run's own configuration"
+    )]
+    Shape {
+        /// The buffer.
+        name: String,
+        /// Its length in the file.
+        found: usize,
+        /// Its length in the configured networks.
+        wanted: usize,
+    },
+}
+
+/// Where the run stands, beside the networks.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Progress {
+    /// Env steps of the run.
+    pub env_steps: u64,
+    /// The replay store they were counted in, and its count then.
+    pub store: u64,
+    /// See `store`.
+    pub store_env_steps: u64,
+    /// Env steps at which the next evaluation is due.
+    pub next_evaluation: u64,
+}
+
+/// A checkpoint in memory.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Checkpoint {
+    tensors: BTreeMap<String, Vec<f32>>,
+    scalars: Scalars,
+    /// The curriculum's state.
+    pub curriculum: Curriculum,
+    /// Where the run stands.
+    pub progress: Progress,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Scalars {
+    updates: u64,
+    actor_steps: u64,
+    critics_steps: u64,
+    log_temperature: f64,
+    temperature_adam: ScalarAdam,
+    statistics: RunningStatistics,
+    rng: ChaCha8Rng,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Header {
+    format: String,
+    version: u32,
+    scalars: Scalars,
+    curriculum: Curriculum,
+    progress: Progress,
+}
+
+/// The flat buffers by name.
+fn buffers(sac: &Sac) -> [(&'static str, &Tensor); 7] {
+    [
+        ("actor", sac.actor.parameters.flat()),
+        ("actor.first_moment", &sac.actor_adam.first),
+        ("actor.second_moment", &sac.actor_adam.second),
+        ("critics", sac.critics.parameters.flat()),
+        ("critics.first_moment", &sac.critics_adam.first),
+        ("critics.second_moment", &sac.critics_adam.second),
+        ("targets", sac.targets.parameters.flat()),
+    ]
+}
+
+impl Checkpoint {
+    /// Copies the state of training; the copy is the caller's to write while training goes on.
+    pub fn take(sac: &Sac, curriculum: &Curriculum, progress: &Progress) -> Self {
+        let tensors = buffers(sac).into_iter().map(|(name, tensor)| (name.to_owned(), to_vec(tensor))).collect();
+        let scalars = Scalars {
+            updates: sac.updates,
+            actor_steps: sac.actor_adam.steps,
+            critics_steps: sac.critics_adam.steps,
+            log_temperature: sac.log_temperature,
+            temperature_adam: sac.temperature_adam.clone(),
+            statistics: sac.statistics.clone(),
+            rng: sac.rng.clone(),
+        };
+        Self { tensors, scalars, curriculum: curriculum.clone(), progress: progress.clone() }
+    }
+
+    /// Puts the networks' state into `sac`, which has the same configuration.
+    pub fn restore(&self, sac: &mut Sac) -> Result<(), CheckpointError> {
+        for (name, tensor) in buffers(sac) {
+            let (found, wanted) = (self.tensors[name].len(), tensor.numel());
+            if found != wanted {
+                return Err(CheckpointError::Shape { name: name.into(), found, wanted });
+            }
+        }
+        let _guard = tch::no_grad_guard();
+        for (name, tensor) in buffers(sac) {
+            tensor.shallow_clone().copy_(&Tensor::from_slice(&self.tensors[name]));
+        }
+        let scalars = self.scalars.clone();
+        let learning_rate = sac.temperature_adam.learning_rate;
+        sac.temperature_adam = scalars.temperature_adam;
+        sac.temperature_adam.learning_rate = learning_rate;
+        sac.updates = scalars.updates;
+        sac.actor_adam.steps = scalars.actor_steps;
+        sac.critics_adam.steps = scalars.critics_steps;
+        sac.log_temperature = scalars.log_temperature;
+        sac.statistics = scalars.statistics;
+        sac.rng = scalars.rng;
+        Ok(())
+    }
+
+    /// The file's name: checkpoints sort by env steps and updates.
+    pub fn file_name(&self) -> String {
+        format!("step-{:012}-{:012}.safetensors", self.progress.env_steps, self.scalars.updates)
+    }
+
+    /// Writes the checkpoint into `folder` and removes all but the newest `kept`.
+    pub fn save(&self, folder: &Path, kept: usize) -> Result<PathBuf, CheckpointError> {
+        let path = folder.join(self.file_name());
+        write_atomically(&path, &self.to_bytes())?;
+        for old in list(folder)?.into_iter().rev().skip(kept) {
+            fs::remove_file(&old).map_err(|source| CheckpointError::Io { path: old, source })?;
+        }
+        Ok(path)
+    }
+
+    /// The newest checkpoint of `folder` that can be read; a damaged one is passed over with a warning. None
+    /// where there is none.
+    pub fn newest(folder: &Path) -> Result<Option<Self>, CheckpointError> {
+        let mut first_error = None;
+        for path in list(folder)?.into_iter().rev() {
+            match Self::load(&path) {
+                Ok(checkpoint) => return Ok(Some(checkpoint)),
+                Err(error) => {
+                    tracing::warn!(%error, "checkpoint passed over");
+                    first_error.get_or_insert(error);
+                }
+            }
+        }
+        first_error.map_or(Ok(None), Err)
+    }
+
+    /// Reads one file.
+    pub fn load(path: &Path) -> Result<Self, CheckpointError> {
+        let bytes = fs::read(path).map_err(|source| CheckpointError::Io { path: path.to_owned(), source })?;
+        Self::from_bytes(&bytes, path)
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        let header = Header {
+            format: FORMAT.into(),
+            version: VERSION,
+            scalars: self.scalars.clone(),
+            curriculum: self.curriculum.clone(),
+            progress: self.progress.clone(),
+        };
+        let header = serde_json::to_string(&header).expect("a header of numbers is JSON");
+        let data: Vec<(&str, Vec<u8>)> = self
+            .tensors
+            .iter()
+            .map(|(name, values)| (name.as_str(), values.iter().flat_map(|value| value.to_le_bytes()).collect()))
+            .collect();
+        let views = data.iter().map(|(name, bytes)| {
+            let view = TensorView::new(Dtype::F32, vec![bytes.len() / 4], bytes);
+            (*name, view.expect("a flat buffer of float32"))
+        });
+        safetensors::serialize(views, Some([("getup".to_owned(), header)].into()))
+            .expect("named float32 buffers are serialisable")
+    }
+
+    fn from_bytes(bytes: &[u8], path: &Path) -> Result<Self, CheckpointError> {
+        let damaged = |problem: String| CheckpointError::Damaged { path: path.to_owned(), problem };
+        let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| damaged(error.to_string()))?;
+        let file = SafeTensors::deserialize(bytes).map_err(|error| damaged(error.to_string()))?;
+        let header = metadata.metadata().as_ref().and_then(|map| map.get("getup"));
+        let header = header.ok_or_else(|| damaged("its metadata has no key \"getup\"".into()))?;
+        let header: serde_json::Value =
+            serde_json::from_str(header).map_err(|error| damaged(error.to_string()))?;
+        if header["format"] != FORMAT {
+            return Err(damaged(format!("its format is {}, not {FORMAT:?}", header["format"])));
+        }
+        match header["version"].as_u64() {
+            Some(version) if version <= u64::from(VERSION) => {}
+            Some(found) => return Err(CheckpointError::Version { path: path.to_owned(), found }),
+            None => return Err(damaged("it names no version".into())),
+        }
+        let header: Header = serde_json::from_value(header).map_err(|error| damaged(error.to_string()))?;
+        let mut tensors = BTreeMap::new();
+        for name in ["actor", "critics"].iter().flat_map(|network| {
+            ["", ".first_moment", ".second_moment"].map(|part| format!("{network}{part}"))
+        }) {
+            tensors.insert(name.clone(), read_buffer(&file, &name).map_err(damaged)?);
+        }
+        tensors.insert("targets".into(), read_buffer(&file, "targets").map_err(damaged)?);
+        let Header { scalars, curriculum, progress, .. } = header;
+        Ok(Self { tensors, scalars, curriculum, progress })
+    }
+}
+
+fn read_buffer(file: &SafeTensors<'_>, name: &str) -> Result<Vec<f32>, String> {
+    let tensor = file.tensor(name).map_err(|_| format!("tensor {name:?} is missing"))?;
+    if tensor.dtype() != Dtype::F32 {
+        return Err(format!("tensor {name:?} is {:?}, not F32", tensor.dtype()));
+    }
+    let bytes = tensor.data().chunks_exact(4);
+    Ok(bytes.map(|bytes| f32::from_le_bytes(bytes.try_into().expect("chunks of four"))).collect())
+}
+
+/// Checkpoint files, oldest first.
+fn list(folder: &Path) -> Result<Vec<PathBuf>, CheckpointError> {
+    let fault = |source| CheckpointError::Io { path: folder.to_owned(), source };
+    let mut files = Vec::new();
+    for entry in fs::read_dir(folder).map_err(fault)? {
+        let path = entry.map_err(fault)?.path();
+        if path.extension().is_some_and(|extension| extension == "safetensors") {
+            files.push(path);
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{CurriculumConfig, SacConfig};
+    use crate::sac::{Batch, TaskShape};
+    use rand::{Rng, SeedableRng};
+    use tch::Device;
+
+    fn batch(index: u64, shape: &TaskShape) -> Batch {
+        let mut rng = ChaCha8Rng::seed_from_u64(index);
+        let mut column = |width: usize| {
+            let values: Vec<f32> = (0..32 * width).map(|_| rng.random_range(-1.0..1.0)).collect();
+            Tensor::from_slice(&values).view([32, width as i64])
+        };
+        Batch {
+            observation: column(shape.observation),
+            next_observation: column(shape.observation),
+            action: column(shape.action) * 0.3,
+            reward: column(1).squeeze_dim(1),
+            discount: column(1).squeeze_dim(1).abs() * 0.97,
+            beta: column(1).abs() * 0.5 + 0.5,
+        }
+    }
+
+    fn train(sac: &mut Sac, shape: &TaskShape, from: u64, to: u64) {
+        for index in from..to {
+            let batch = batch(index, shape);
+            sac.merge_statistics(&batch);
+            sac.update(&batch).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_resumed_learner_is_bit_identical_given_the_same_minibatches() {
+        let folder = tempfile::tempdir().unwrap();
+        let shape = TaskShape { observation: 11, action: 4, unnormalized: vec![10] };
+        let config = SacConfig { hidden: vec![32, 32], normalize_observations: true, ..SacConfig::default() };
+        let curriculum = Curriculum::new(CurriculumConfig::default());
+        let progress = Progress { env_steps: 1234, store: 7, store_env_steps: 1200, next_evaluation: 20_000 };
+        let mut sac = Sac::new(&shape, &config, 9, Device::Cpu);
+        train(&mut sac, &shape, 0, 50);
+        Checkpoint::take(&sac, &curriculum, &progress).save(folder.path(), 3).unwrap();
+        train(&mut sac, &shape, 50, 100);
+
+        let loaded = Checkpoint::newest(folder.path()).unwrap().unwrap();
+        assert_eq!((&loaded.curriculum, &loaded.progress), (&curriculum, &progress));
+        let mut resumed = Sac::new(&shape, &config, 1, Device::Cpu);
+        loaded.restore(&mut resumed).unwrap();
+        train(&mut resumed, &shape, 50, 100);
+        let end = |sac: &Sac| Checkpoint::take(sac, &curriculum, &progress);
+        assert_eq!(end(&resumed), end(&sac));
+        assert_eq!(end(&resumed).to_bytes(), end(&sac).to_bytes());
+    }
+
+    #[test]
+    fn the_newest_good_checkpoint_is_taken_and_old_ones_go() {
+        let folder = tempfile::tempdir().unwrap();
+        let shape = TaskShape { observation: 2, action: 1, unnormalized: vec![] };
+        let config = SacConfig { hidden: vec![4], ..SacConfig::default() };
+        let sac = Sac::new(&shape, &config, 0, Device::Cpu);
+        let curriculum = Curriculum::new(CurriculumConfig::default());
+        let mut newest = PathBuf::new();
+        for env_steps in [5, 10, 100_000, 20] {
+            let progress = Progress { env_steps, ..Progress::default() };
+            let path = Checkpoint::take(&sac, &curriculum, &progress).save(folder.path(), 3).unwrap();
+            if env_steps == 100_000 {
+                newest = path;
+            }
+        }
+        assert_eq!(list(folder.path()).unwrap().len(), 3);
+        assert_eq!(Checkpoint::newest(folder.path()).unwrap().unwrap().progress.env_steps, 100_000);
+        let bytes = fs::read(&newest).unwrap();
+        fs::write(&newest, &bytes[..bytes.len() / 2]).unwrap();
+        assert_eq!(Checkpoint::newest(folder.path()).unwrap().unwrap().progress.env_steps, 20);
+        let wider = SacConfig { hidden: vec![5], ..SacConfig::default() };
+        let mut other = Sac::new(&shape, &wider, 0, Device::Cpu);
+        let error = Checkpoint::newest(folder.path()).unwrap().unwrap().restore(&mut other).unwrap_err();
+        assert!(matches!(error, CheckpointError::Shape { .. }), "{error}");
+    }
+}

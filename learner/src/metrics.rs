@@ -1,0 +1,89 @@
+//! The learner's metrics.
+
+use getup_telemetry::Registry;
+use getup_telemetry::prometheus::{
+    Gauge, Histogram, HistogramOpts, IntCounter, IntGauge, register_gauge_with_registry,
+    register_histogram_with_registry, register_int_counter_with_registry, register_int_gauge_with_registry,
+};
+
+use crate::sac::Losses;
+
+/// Handles to everything the learner exposes.
+#[derive(Clone)]
+pub(crate) struct LearnerMetrics {
+    pub(crate) updates: IntCounter,
+    pub(crate) env_steps: IntGauge,
+    pub(crate) update_seconds: Histogram,
+    pub(crate) wait_seconds: Histogram,
+    critic_loss: Gauge,
+    actor_loss: Gauge,
+    temperature: Gauge,
+    entropy: Gauge,
+    q: Gauge,
+    pub(crate) beta: Gauge,
+    pub(crate) stage: IntGauge,
+    pub(crate) stage_env_steps: IntGauge,
+    pub(crate) stage_limit_env_steps: IntGauge,
+    pub(crate) policy_version: IntGauge,
+    pub(crate) evaluations: IntCounter,
+    pub(crate) evaluations_outstanding: IntGauge,
+    pub(crate) evaluation_return_mean: Gauge,
+    pub(crate) evaluation_return_min: Gauge,
+    pub(crate) promotions: IntCounter,
+    pub(crate) checkpoints: IntCounter,
+    pub(crate) checkpoint_seconds: Histogram,
+    pub(crate) finished: IntGauge,
+}
+
+impl LearnerMetrics {
+    /// Registers all; a registry takes one learner.
+    pub(crate) fn new(registry: &Registry) -> Self {
+        const PROVEN: &str = "the learner's metrics are registered once a registry, under names of their own";
+        let counter = |name: &str, help: &str| {
+            register_int_counter_with_registry!(format!("getup_learner_{name}"), help, registry).expect(PROVEN)
+        };
+        let whole = |name: &str, help: &str| {
+            register_int_gauge_with_registry!(format!("getup_learner_{name}"), help, registry).expect(PROVEN)
+        };
+        let gauge = |name: &str, help: &str| {
+            register_gauge_with_registry!(format!("getup_learner_{name}"), help, registry).expect(PROVEN)
+        };
+        let seconds = |name: &str, help: &str| {
+            let buckets = (0..16).map(|power| 1e-4 * 2f64.powi(power)).collect();
+            let options = HistogramOpts::new(format!("getup_learner_{name}"), help).buckets(buckets);
+            register_histogram_with_registry!(options, registry).expect(PROVEN)
+        };
+        Self {
+            updates: counter("updates_total", "Updates of the networks since this process started."),
+            env_steps: whole("env_steps", "Env steps of the run that have reached the replay."),
+            update_seconds: seconds("update_seconds", "Time of one update, without waiting for its minibatch."),
+            wait_seconds: seconds("wait_seconds", "Time waited for a minibatch."),
+            critic_loss: gauge("critic_loss", "Mean squared error of the critics, summed over them."),
+            actor_loss: gauge("actor_loss", "Mean of temperature times log-probability less Q."),
+            temperature: gauge("temperature", "SAC's temperature."),
+            entropy: gauge("entropy_nats", "Mean entropy of the policy over a minibatch, in nats."),
+            q: gauge("q", "Mean Q of a minibatch's own actions."),
+            beta: gauge("beta", "Torque-limit multiplier of the stage."),
+            stage: whole("stage", "Stage of the curriculum, from 0."),
+            stage_env_steps: whole("stage_env_steps", "Env steps spent in the stage, N_i."),
+            stage_limit_env_steps: whole("stage_limit_env_steps", "Env steps the stage may last, M_i; 0 for none."),
+            policy_version: whole("policy_version", "Counter of the newest policy that was broadcast."),
+            evaluations: counter("evaluations_total", "Evaluations reported since this process started."),
+            evaluations_outstanding: whole("evaluations_outstanding", "Evaluations offered and not yet reported."),
+            evaluation_return_mean: gauge("evaluation_return_mean", "Mean return of the newest evaluation."),
+            evaluation_return_min: gauge("evaluation_return_min", "Minimum return of the newest evaluation."),
+            promotions: counter("promotions_total", "Stages passed since this process started."),
+            checkpoints: counter("checkpoints_total", "Checkpoints written since this process started."),
+            checkpoint_seconds: seconds("checkpoint_seconds", "Time to write a checkpoint, beside training."),
+            finished: whole("finished", "1 once training is over."),
+        }
+    }
+
+    pub(crate) fn losses(&self, losses: &Losses) {
+        self.critic_loss.set(losses.critic);
+        self.actor_loss.set(losses.actor);
+        self.temperature.set(losses.temperature);
+        self.entropy.set(losses.entropy);
+        self.q.set(losses.q);
+    }
+}

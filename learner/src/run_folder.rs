@@ -1,0 +1,132 @@
+//! A run's folder: what lies where.
+//!
+//! ```text
+//! runs/<name>/
+//!   config.toml          the whole effective configuration
+//!   incarnation          how often a learner was started on this run
+//!   checkpoints/         step-<env steps>.safetensors, the newest few
+//!   replay/              the replay's store
+//!   evaluations.jsonl    a line an evaluation
+//!   timings.jsonl        the wall time of the same
+//!   models/              stage-<i>.safetensors at each promotion, best.safetensors, last.safetensors
+//!   diverged/            states of simulations that diverged, for `getup rollout`
+//! ```
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+/// A run's folder cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot {action} {path}: {source}")]
+pub struct FolderError {
+    action: &'static str,
+    path: PathBuf,
+    source: io::Error,
+}
+
+fn fault(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> FolderError {
+    move |source| FolderError { action, path: path.to_owned(), source }
+}
+
+/// The folder of one run.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RunFolder {
+    root: PathBuf,
+}
+
+impl RunFolder {
+    /// The folder at `root`; nothing is made yet.
+    pub fn new(root: impl Into<PathBuf>) -> Self {
+        Self { root: root.into() }
+    }
+
+    /// The folder itself.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// The effective configuration of the run.
+    pub fn config(&self) -> PathBuf {
+        self.root.join("config.toml")
+    }
+
+    /// Checkpoints.
+    pub fn checkpoints(&self) -> PathBuf {
+        self.root.join("checkpoints")
+    }
+
+    /// The replay's store.
+    pub fn replay(&self) -> PathBuf {
+        self.root.join("replay")
+    }
+
+    /// Model files.
+    pub fn models(&self) -> PathBuf {
+        self.root.join("models")
+    }
+
+    /// One model file, by its stem: `best`, `last`, `stage-3`.
+    pub fn model(&self, stem: &str) -> PathBuf {
+        self.models().join(format!("{stem}.safetensors"))
+    }
+
+    /// A line an evaluation; byte for byte the same for the same seed under `--deterministic`.
+    pub fn evaluations(&self) -> PathBuf {
+        self.root.join("evaluations.jsonl")
+    }
+
+    /// The wall time of each evaluation.
+    pub fn timings(&self) -> PathBuf {
+        self.root.join("timings.jsonl")
+    }
+
+    /// Makes the folder and its parts.
+    pub fn create(&self) -> Result<(), FolderError> {
+        for folder in [self.checkpoints(), self.models()] {
+            fs::create_dir_all(&folder).map_err(fault("create", &folder))?;
+        }
+        Ok(())
+    }
+
+    /// The number of this start of a learner on this run, from 1; every call counts one.
+    pub fn next_incarnation(&self) -> Result<u64, FolderError> {
+        let path = self.root.join("incarnation");
+        let last = match fs::read_to_string(&path) {
+            Ok(text) => text.trim().parse::<u64>().map_err(|error| {
+                let source = io::Error::new(io::ErrorKind::InvalidData, format!("{text:?} is no count: {error}"));
+                fault("read", &path)(source)
+            })?,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => 0,
+            Err(error) => return Err(fault("read", &path)(error)),
+        };
+        write_atomically(&path, format!("{}\n", last + 1).as_bytes())?;
+        Ok(last + 1)
+    }
+}
+
+/// Appends one JSON line and gets it to the disk's cache before it returns.
+pub fn append_line(path: &Path, line: &impl Serialize) -> Result<(), FolderError> {
+    let mut text = serde_json::to_string(line).expect("lines are plain structures of numbers and strings");
+    text.push('\n');
+    let mut file = OpenOptions::new().create(true).append(true).open(path).map_err(fault("open", path))?;
+    file.write_all(text.as_bytes()).map_err(fault("append to", path))
+}
+
+/// Writes a file under a temporary name, syncs it, and renames it: a reader sees the old one or the new one.
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FolderError> {
+    let unfinished = path.with_extension("unfinished");
+    let write = || -> io::Result<()> {
+        let mut file = File::create(&unfinished)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&unfinished, path)?;
+        if let Some(folder) = path.parent() {
+            File::open(folder)?.sync_all()?;
+        }
+        Ok(())
+    };
+    write().map_err(fault("write", path))
+}

@@ -1,0 +1,175 @@
+//! SAC against numbers that are not ours, and on a task whose optimum is known.
+
+use std::collections::BTreeMap;
+
+use super::*;
+use crate::config::TargetEntropy;
+use crate::parameters::Parameters;
+use serde::Deserialize;
+
+#[derive(Deserialize)]
+struct Record {
+    actor: BTreeMap<String, Vec<f32>>,
+    critics: BTreeMap<String, Vec<f32>>,
+    updates: Vec<RecordedUpdate>,
+}
+
+#[derive(Deserialize)]
+struct RecordedUpdate {
+    batch: BTreeMap<String, Vec<f32>>,
+    next_noise: Vec<f32>,
+    noise: Vec<f32>,
+    critic_loss: f64,
+    actor_loss: f64,
+    entropy: f64,
+    actor: BTreeMap<String, Vec<f32>>,
+    critics: BTreeMap<String, Vec<f32>>,
+    targets: BTreeMap<String, Vec<f32>>,
+    log_alpha: f64,
+}
+
+fn load(parameters: &mut Parameters, recorded: &BTreeMap<String, Vec<f32>>) {
+    let values: Vec<f32> =
+        parameters.to_values().iter().flat_map(|(name, _, _)| recorded[name].clone()).collect();
+    parameters.copy_from(&values);
+}
+
+fn assert_close(parameters: &Parameters, recorded: &BTreeMap<String, Vec<f32>>, what: &str) {
+    for (name, _, values) in parameters.to_values() {
+        for (index, (ours, theirs)) in values.iter().zip(&recorded[&name]).enumerate() {
+            assert!((ours - theirs).abs() < 2e-6, "{what} {name}[{index}]: {ours}, PyTorch {theirs}");
+        }
+    }
+}
+
+#[test]
+fn updates_of_a_tiny_network_match_pytorch() {
+    let record: Record = serde_json::from_str(include_str!("../../tests/data/sac_update.json")).unwrap();
+    let config = SacConfig {
+        hidden: vec![4, 4],
+        actor_lr: 1e-3,
+        critic_lr: 2e-3,
+        temperature_lr: 3e-3,
+        batch: 5,
+        ..SacConfig::default()
+    };
+    let shape = TaskShape { observation: 3, action: 2, unnormalized: vec![] };
+    let mut sac = Sac::new(&shape, &config, 0, Device::Cpu);
+    load(&mut sac.actor.parameters, &record.actor);
+    load(&mut sac.critics.parameters, &record.critics);
+    load(&mut sac.targets.parameters, &record.critics);
+    for update in &record.updates {
+        let column = |name: &str, size: &[i64]| Tensor::from_slice(&update.batch[name]).view(size);
+        let batch = Batch {
+            observation: column("observation", &[5, 3]),
+            action: column("action", &[5, 2]),
+            reward: column("reward", &[5]),
+            next_observation: column("next_observation", &[5, 3]),
+            discount: column("discount", &[5]),
+            beta: column("beta", &[5, 1]),
+        };
+        let noise = |values: &[f32]| Tensor::from_slice(values).view([5, 2]);
+        let losses =
+            sac.update_with_noise(&batch, &noise(&update.next_noise), &noise(&update.noise)).unwrap();
+        assert!((losses.critic - update.critic_loss).abs() < 1e-5);
+        assert!((losses.actor - update.actor_loss).abs() < 1e-5);
+        assert!((losses.entropy - update.entropy).abs() < 1e-4);
+        assert!((sac.log_temperature - update.log_alpha).abs() < 1e-6);
+        assert_close(&sac.actor.parameters, &update.actor, "actor");
+        assert_close(&sac.critics.parameters, &update.critics, "critic");
+        assert_close(&sac.targets.parameters, &update.targets, "target");
+    }
+}
+
+/// A point on a line is moved to where the action says, and paid `1 − (position − 0.5)²`: the optimum is to
+/// choose 0.5 from everywhere, and its value is 1 / (1 − γ).
+fn toy_batch(size: usize, gamma: f32, rng: &mut ChaCha8Rng) -> Batch {
+    let uniform = |rng: &mut ChaCha8Rng| rng.random_range(-1.0f32..1.0);
+    let observation: Vec<f32> = (0..size).map(|_| uniform(rng)).collect();
+    let action: Vec<f32> = (0..size).map(|_| uniform(rng)).collect();
+    let reward: Vec<f32> = action.iter().map(|action| 1.0 - (action - 0.5).powi(2)).collect();
+    let rows = size as i64;
+    Batch {
+        observation: Tensor::from_slice(&observation).view([rows, 1]),
+        next_observation: Tensor::from_slice(&action).view([rows, 1]),
+        action: Tensor::from_slice(&action).view([rows, 1]),
+        reward: Tensor::from_slice(&reward),
+        discount: Tensor::full([rows], f64::from(gamma), (Kind::Float, Device::Cpu)),
+        beta: Tensor::ones([rows, 1], (Kind::Float, Device::Cpu)),
+    }
+}
+
+fn toy_config() -> SacConfig {
+    SacConfig {
+        hidden: vec![32, 32],
+        batch: 64,
+        gamma: 0.8,
+        tau: 0.02,
+        actor_lr: 1e-3,
+        critic_lr: 3e-3,
+        temperature_lr: 1e-3,
+        initial_temperature: 0.01,
+        target_entropy: TargetEntropy::Nats(-3.0),
+        ..SacConfig::default()
+    }
+}
+
+#[test]
+fn a_toy_task_is_learned_to_its_known_optimum_with_and_without_normalisation() {
+    for normalize_observations in [false, true] {
+        let config = SacConfig { normalize_observations, ..toy_config() };
+        let shape = TaskShape { observation: 1, action: 1, unnormalized: vec![] };
+        let mut sac = Sac::new(&shape, &config, 3, Device::Cpu);
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let mut losses = Losses::default();
+        for _ in 0..1500 {
+            let batch = toy_batch(64, 0.8, &mut rng);
+            sac.merge_statistics(&batch);
+            losses = sac.update(&batch).unwrap();
+        }
+        let mut forward = getup_policy::Forward::new(&sac.policy(), 9);
+        let positions: Vec<f32> = (-4..=4).map(|i| i as f32 / 4.0).collect();
+        for (position, mean) in positions.iter().zip(forward.run(&positions).mean) {
+            assert!((mean.tanh() - 0.5).abs() < 0.1, "at {position}: {}", mean.tanh());
+        }
+        // Mean over uniform actions of 1 − (a − 0.5)² + γ/(1 − γ): 1 − 7/12 + 4.
+        assert!((losses.q - 4.42).abs() < 0.3, "Q {}", losses.q);
+    }
+}
+
+#[test]
+fn the_actors_forward_pass_agrees_with_the_learners_network_on_every_shape() {
+    for (hidden, observation, action) in
+        [(vec![1024, 1024], 68, 21), (vec![256, 256], 68, 21), (vec![64], 62, 18), (vec![40, 30, 20], 64, 19)]
+    {
+        let config = SacConfig { hidden, normalize_observations: true, ..SacConfig::default() };
+        let shape = TaskShape { observation, action, unnormalized: vec![observation - 1] };
+        let mut sac = Sac::new(&shape, &config, 5, Device::Cpu);
+        let mut rng = ChaCha8Rng::seed_from_u64(6);
+        let values: Vec<f32> = (0..33 * observation).map(|_| rng.random_range(-3.0..3.0)).collect();
+        sac.statistics.merge(&values);
+        let policy = Policy::from_bytes(&sac.policy().to_bytes()).unwrap();
+        let mut forward = getup_policy::Forward::new(&policy, 33);
+        let heads = forward.run(&values);
+        let input = Tensor::from_slice(&values).view([33, observation as i64]);
+        let gaussian = tch::no_grad(|| sac.actor.forward(&sac.normalize(&input)));
+        for (ours, theirs) in heads.mean.iter().zip(to_vec(gaussian.mean())) {
+            assert!((ours - theirs).abs() < 1e-5, "{ours} {theirs}");
+        }
+        for (ours, theirs) in heads.log_std.iter().zip(to_vec(gaussian.log_std())) {
+            assert!((ours - theirs).abs() < 1e-5, "{ours} {theirs}");
+        }
+    }
+}
+
+#[test]
+fn a_loss_that_is_not_a_number_stops_the_update_and_says_which() {
+    let shape = TaskShape { observation: 1, action: 1, unnormalized: vec![] };
+    let mut sac = Sac::new(&shape, &toy_config(), 0, Device::Cpu);
+    let mut batch = toy_batch(64, 0.8, &mut ChaCha8Rng::seed_from_u64(0));
+    batch.reward = batch.reward * f64::INFINITY;
+    let before = to_vec(sac.critics.parameters.flat());
+    let error = sac.update(&batch).unwrap_err();
+    assert_eq!((error.name, error.update), ("critic", 0));
+    assert_eq!(to_vec(sac.critics.parameters.flat()), before);
+}

@@ -1,0 +1,83 @@
+//! Running mean and variance of observations, merged batch by batch (Chan et al. 1979).
+
+use getup_policy::ObservationStatistics;
+use serde::{Deserialize, Serialize};
+
+/// Variances are never taken to be smaller: a number that hardly moves must not be blown up.
+const VARIANCE_FLOOR: f64 = 1e-4;
+/// Largest magnitude of a normalised number.
+const CLIP: f32 = 10.0;
+
+/// Statistics over all observations seen so far; part of the checkpoint.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct RunningStatistics {
+    count: f64,
+    mean: Vec<f64>,
+    /// Sum of squared deviations from the mean.
+    squares: Vec<f64>,
+    /// Numbers that stay as they are, such as β̂.
+    unnormalized: Vec<usize>,
+}
+
+impl RunningStatistics {
+    pub(crate) fn new(width: usize, unnormalized: Vec<usize>) -> Self {
+        Self { count: 0.0, mean: vec![0.0; width], squares: vec![0.0; width], unnormalized }
+    }
+
+    /// Merges rows of observations, `[n, width]`.
+    pub(crate) fn merge(&mut self, rows: &[f32]) {
+        let width = self.mean.len();
+        let added = (rows.len() / width) as f64;
+        if added == 0.0 {
+            return;
+        }
+        let total = self.count + added;
+        for column in 0..width {
+            let values = || rows.iter().skip(column).step_by(width).map(|value| f64::from(*value));
+            let mean = values().sum::<f64>() / added;
+            let squares = values().map(|value| (value - mean).powi(2)).sum::<f64>();
+            let shift = mean - self.mean[column];
+            self.squares[column] += squares + shift * shift * self.count * added / total;
+            self.mean[column] += shift * added / total;
+        }
+        self.count = total;
+    }
+
+    /// What travels with the weights.
+    pub(crate) fn snapshot(&self) -> ObservationStatistics {
+        let variance = |squares: &f64| if self.count > 0.0 { squares / self.count } else { 1.0 };
+        let mut mean: Vec<f32> = self.mean.iter().map(|mean| *mean as f32).collect();
+        let mut std: Vec<f32> =
+            self.squares.iter().map(|squares| variance(squares).max(VARIANCE_FLOOR).sqrt() as f32).collect();
+        for index in &self.unnormalized {
+            mean[*index] = 0.0;
+            std[*index] = 1.0;
+        }
+        ObservationStatistics { mean, std, clip: CLIP }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn merging_parts_gives_the_statistics_of_the_whole() {
+        let rows: Vec<f32> = (0..300).map(|i| (i as f32 * 0.37).sin() * 5.0 + (i % 3) as f32).collect();
+        let mut whole = RunningStatistics::new(3, vec![2]);
+        whole.merge(&rows);
+        let mut parts = RunningStatistics::new(3, vec![2]);
+        for part in rows.chunks(3 * 7) {
+            parts.merge(part);
+        }
+        let (whole, parts) = (whole.snapshot(), parts.snapshot());
+        for column in 0..3 {
+            assert!((whole.mean[column] - parts.mean[column]).abs() < 1e-5);
+            assert!((whole.std[column] - parts.std[column]).abs() < 1e-5);
+        }
+        assert_eq!((whole.mean[2], whole.std[2]), (0.0, 1.0));
+        let column: Vec<f32> = rows.iter().step_by(3).copied().collect();
+        let mean = column.iter().sum::<f32>() / 100.0;
+        assert!((whole.mean[0] - mean).abs() < 1e-4);
+    }
+}

@@ -1,0 +1,480 @@
+//! Training: a minibatch in, an update out; and what an update brings with it.
+//!
+//! [`Trainer::tick`] is the whole of training on one minibatch: update, broadcast, offer an evaluation when one is
+//! due, take what was reported, let the curriculum decide, write a checkpoint. [`Trainer::run`] feeds it from a
+//! [`MinibatchSource`]; the deterministic mode of `getup train` feeds it step by step. Nothing here knows whether
+//! replay and actors are in the same process.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use getup_policy::Policy;
+use getup_proto::{PolicyVersion, v1};
+use getup_replay::{Minibatch, MinibatchSource, ReplayCounters, SampleError};
+use getup_telemetry::{Registry, Shutdown};
+use serde::Serialize;
+use tch::Tensor;
+
+use crate::checkpoint::{Checkpoint, CheckpointError, Progress};
+use crate::config::{ConfigError, CurriculumConfig, EvaluationConfig, LearnerConfig, SacConfig};
+use crate::curriculum::{Curriculum, Decision, Outcome, StageResult};
+use crate::hub::{Evaluation, Hub, Standing};
+use crate::metrics::LearnerMetrics;
+use crate::run_folder::{FolderError, RunFolder, append_line};
+use crate::sac::{Batch, NonFiniteLoss, Sac, TaskShape};
+
+mod checkpoints;
+mod pace;
+
+use checkpoints::Checkpoints;
+use pace::Pace;
+
+/// How long the end of training waits for evaluations that are still out.
+const LAST_REPORTS: Duration = Duration::from_secs(120);
+
+/// Why training stopped.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainError {
+    /// A setting.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The run's folder.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
+    /// A checkpoint.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// A model file.
+    #[error(transparent)]
+    Model(#[from] getup_policy::ModelError),
+    /// The loss.
+    #[error("training stopped: {0}")]
+    Loss(#[from] NonFiniteLoss),
+    /// The replay.
+    #[error("cannot sample from the replay: {0}")]
+    Sample(#[from] SampleError),
+    /// A minibatch lacks a column.
+    #[error("the replay's minibatches have no column {0:?}: do replay and learner run the same configuration?")]
+    Column(&'static str),
+}
+
+/// Everything that training a run depends on.
+#[derive(Clone, Debug)]
+pub struct TrainerConfig {
+    /// The run's name, in models' metadata.
+    pub run: String,
+    /// The character, in models' metadata.
+    pub character: String,
+    /// The run's seed.
+    pub seed: u64,
+    /// Env steps after which training ends; none for the curriculum's end alone.
+    pub steps: Option<u64>,
+    /// What SAC must know of the task.
+    pub shape: TaskShape,
+    /// SAC.
+    pub sac: SacConfig,
+    /// The curriculum.
+    pub curriculum: CurriculumConfig,
+    /// Evaluations.
+    pub evaluation: EvaluationConfig,
+    /// The process.
+    pub learner: LearnerConfig,
+}
+
+/// How training ended, or that it goes on.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Ending {
+    /// The curriculum is over.
+    Curriculum(Outcome),
+    /// The run reached the env steps it was given.
+    Steps(u64),
+    /// It was asked to stop; the checkpoint resumes it.
+    Shutdown,
+}
+
+/// A line of `evaluations.jsonl`.
+#[derive(Debug, Serialize)]
+struct EvaluationLine<'a> {
+    version: String,
+    env_steps: u64,
+    updates: u64,
+    stage: u32,
+    beta: f64,
+    mean: f64,
+    min: f64,
+    returns: &'a [f64],
+}
+
+/// A line of `timings.jsonl`.
+#[derive(Debug, Serialize)]
+struct TimingLine {
+    version: String,
+    env_steps: u64,
+    updates: u64,
+    /// Since this process began to train.
+    seconds: f64,
+    updates_per_second: f64,
+}
+
+/// The state of a training run.
+pub struct Trainer {
+    config: TrainerConfig,
+    sac: Sac,
+    curriculum: Curriculum,
+    progress: Progress,
+    hub: Arc<Hub>,
+    folder: RunFolder,
+    checkpoints: Checkpoints,
+    metrics: LearnerMetrics,
+    pace: Pace,
+    version: PolicyVersion,
+    evaluation: Option<v1::EvaluationSummary>,
+    ending: Option<Ending>,
+}
+
+impl Trainer {
+    /// Training from the newest checkpoint of `folder` where `resume`, else from untrained networks; publishes its
+    /// policy at once and, on a new run, offers it for evaluation.
+    pub fn new(
+        config: TrainerConfig,
+        folder: RunFolder,
+        hub: Arc<Hub>,
+        incarnation: u64,
+        resume: bool,
+        device: tch::Device,
+        registry: &Registry,
+    ) -> Result<Self, TrainError> {
+        folder.create()?;
+        let mut sac = Sac::new(&config.shape, &config.sac, config.seed, device);
+        let mut curriculum = Curriculum::new(config.curriculum.clone());
+        let mut progress = Progress { next_evaluation: config.evaluation.every, ..Progress::default() };
+        let checkpoint = if resume { Checkpoint::newest(&folder.checkpoints())? } else { None };
+        let resumed = checkpoint.is_some();
+        if let Some(checkpoint) = checkpoint {
+            checkpoint.restore(&mut sac)?;
+            curriculum = checkpoint.curriculum;
+            progress = checkpoint.progress;
+            tracing::info!(env_steps = progress.env_steps, updates = sac.updates(), "training resumes");
+        }
+        let metrics = LearnerMetrics::new(registry);
+        let mut trainer = Self {
+            checkpoints: Checkpoints::new(folder.checkpoints(), &config.learner, metrics.clone()),
+            pace: Pace::new(sac.updates()),
+            version: PolicyVersion { incarnation, counter: 0 },
+            ending: curriculum.outcome().map(Ending::Curriculum),
+            evaluation: None,
+            config,
+            sac,
+            curriculum,
+            progress,
+            hub,
+            folder,
+            metrics,
+        };
+        if trainer.ending.is_some() {
+            trainer.publish_final()?;
+        } else {
+            let policy = trainer.publish();
+            if !resumed {
+                trainer.offer(policy);
+            }
+        }
+        trainer.show();
+        Ok(trainer)
+    }
+
+    /// How training ended; none while it goes on.
+    pub fn ending(&self) -> Option<Ending> {
+        self.ending
+    }
+
+    /// Trains on minibatches of `source` until the curriculum's end, the last env step, or `shutdown`, and leaves
+    /// a checkpoint.
+    pub fn run(&mut self, source: &mut dyn MinibatchSource, shutdown: &Shutdown) -> Result<Ending, TrainError> {
+        while self.ending.is_none() && !shutdown.is_triggered() {
+            let asked = Instant::now();
+            match source.next() {
+                Ok(minibatch) => {
+                    self.metrics.wait_seconds.observe(asked.elapsed().as_secs_f64());
+                    self.tick(&minibatch)?;
+                }
+                Err(SampleError::Shutdown) => break,
+                Err(error) => return Err(error.into()),
+            }
+        }
+        if matches!(self.ending, Some(Ending::Steps(_))) {
+            self.await_last_reports(shutdown)?;
+        }
+        self.finish()
+    }
+
+    /// One update and everything that follows from it.
+    pub fn tick(&mut self, minibatch: &Minibatch) -> Result<(), TrainError> {
+        let started = Instant::now();
+        self.progress.count(&minibatch.counters);
+        let batch = Batch::from_minibatch(minibatch)?;
+        if self.progress.env_steps < self.config.sac.normalize_until {
+            self.sac.merge_statistics(&batch);
+        }
+        let losses = self.sac.update(&batch)?;
+        self.metrics.updates.inc();
+        self.metrics.update_seconds.observe(started.elapsed().as_secs_f64());
+        if self.pace.count() {
+            self.metrics.losses(&losses);
+            self.show();
+        }
+        self.take_reports()?;
+        if self.ending.is_some() {
+            return Ok(());
+        }
+        if self.progress.env_steps >= self.progress.next_evaluation {
+            let every = self.config.evaluation.every;
+            self.progress.next_evaluation = (self.progress.env_steps / every + 1) * every;
+            let policy = self.publish();
+            self.offer(policy);
+        } else if self.sac.updates().is_multiple_of(self.config.learner.publish_every) {
+            self.publish();
+        }
+        if self.config.steps.is_some_and(|steps| self.progress.env_steps >= steps) {
+            let policy = self.publish();
+            self.offer(policy);
+            self.ending = Some(Ending::Steps(self.progress.env_steps));
+        } else if self.checkpoints.due() {
+            self.checkpoint();
+        }
+        Ok(())
+    }
+
+    /// Takes every evaluation that was reported, in order, and lets the curriculum decide.
+    pub fn take_reports(&mut self) -> Result<(), TrainError> {
+        while let Some((evaluation, episodes)) = self.hub.take_reported() {
+            self.evaluated(&evaluation, &episodes)?;
+        }
+        Ok(())
+    }
+
+    /// The end of training: the last models and a checkpoint on disk, the final policy broadcast.
+    pub fn finish(&mut self) -> Result<Ending, TrainError> {
+        let ending = self.ending.unwrap_or(Ending::Shutdown);
+        let last = self.describe(self.sac.policy(), self.curriculum.beta());
+        last.save(self.folder.model("last"))?;
+        if ending != Ending::Shutdown {
+            self.publish_final()?;
+        }
+        self.checkpoint();
+        self.checkpoints.finish()?;
+        self.show();
+        Ok(ending)
+    }
+
+    fn await_last_reports(&mut self, shutdown: &Shutdown) -> Result<(), TrainError> {
+        let hub = Arc::clone(&self.hub);
+        let wait = hub.waits().begin("learner", "the last evaluation is not reported yet".into());
+        let until = Instant::now() + LAST_REPORTS;
+        while hub.outstanding() > 0 && Instant::now() < until && !shutdown.is_triggered() {
+            hub.wait_for_report(Duration::from_millis(200));
+            self.take_reports()?;
+        }
+        drop(wait);
+        Ok(())
+    }
+
+    fn evaluated(&mut self, evaluation: &Evaluation, episodes: &[v1::EpisodeResult]) -> Result<(), TrainError> {
+        let policy = &evaluation.policy;
+        let returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
+        let mean = returns.iter().sum::<f64>() / returns.len() as f64;
+        let min = returns.iter().copied().fold(f64::INFINITY, f64::min);
+        let version = PolicyVersion::from(policy.version.unwrap_or_default());
+        let (beta, stage) = (policy.values["beta"], policy.stage);
+        let line = EvaluationLine {
+            version: version.to_string(),
+            env_steps: policy.env_steps,
+            updates: evaluation.updates,
+            stage,
+            beta,
+            mean,
+            min,
+            returns: &returns,
+        };
+        append_line(&self.folder.evaluations(), &line)?;
+        let timing = TimingLine {
+            version: line.version,
+            env_steps: line.env_steps,
+            updates: line.updates,
+            seconds: self.pace.seconds(),
+            updates_per_second: self.pace.per_second(),
+        };
+        append_line(&self.folder.timings(), &timing)?;
+        tracing::info!(env_steps = policy.env_steps, updates = evaluation.updates, beta, mean, min, "evaluation");
+        self.metrics.evaluations.inc();
+        self.metrics.evaluation_return_mean.set(mean);
+        self.metrics.evaluation_return_min.set(min);
+        let env_steps = policy.env_steps;
+        self.evaluation = Some(v1::EvaluationSummary { version: policy.version, env_steps, mean, min, beta });
+        let result = StageResult { stage, env_steps, min_return: min };
+        let decision = self.curriculum.report(result, self.progress.env_steps);
+        self.decided(decision, evaluation, (mean, min))
+    }
+
+    fn decided(
+        &mut self,
+        decision: Decision,
+        evaluation: &Evaluation,
+        (mean, min): (f64, f64),
+    ) -> Result<(), TrainError> {
+        let passed = match decision {
+            Decision::Ignore | Decision::Stay => None,
+            Decision::Promote { passed, next } => {
+                tracing::info!(passed, next, min, "promoted: the next stage is weaker");
+                self.metrics.promotions.inc();
+                Some(passed)
+            }
+            Decision::Finish(outcome) => {
+                tracing::info!(?outcome, "the curriculum is over");
+                self.ending = Some(Ending::Curriculum(outcome));
+                match outcome {
+                    Outcome::FloorPassed { beta } => Some(beta),
+                    Outcome::StageOutlasted { .. } => None,
+                }
+            }
+        };
+        if let Some(beta) = passed {
+            let model = Policy::from_bytes(&evaluation.policy.networks[0].model)?;
+            let mut model = self.describe(model, beta);
+            model.metadata.insert("env_steps".into(), evaluation.policy.env_steps.to_string());
+            model.metadata.insert("updates".into(), evaluation.updates.to_string());
+            model.metadata.insert("evaluation_mean".into(), mean.to_string());
+            model.metadata.insert("evaluation_min".into(), min.to_string());
+            model.save(self.folder.model(&format!("stage-{}", evaluation.policy.stage)))?;
+            model.save(self.folder.model("best"))?;
+        }
+        if decision != Decision::Ignore && decision != Decision::Stay {
+            self.checkpoint();
+        }
+        if matches!(decision, Decision::Promote { .. }) {
+            self.publish();
+        }
+        self.show();
+        Ok(())
+    }
+
+    /// Broadcasts the actor as it is now, under a new version (but the first).
+    fn publish(&mut self) -> Arc<v1::PolicyUpdate> {
+        let policy = self.describe(self.sac.policy(), self.curriculum.beta());
+        self.broadcast(&policy, false)
+    }
+
+    /// Broadcasts the policy that training ends with: the snapshot of the last stage that passed, or the newest.
+    fn publish_final(&mut self) -> Result<(), TrainError> {
+        let best = self.folder.model("best");
+        let policy = match self.ending {
+            Some(Ending::Curriculum(_)) if best.exists() => Policy::load(best)?,
+            _ => self.describe(self.sac.policy(), self.curriculum.beta()),
+        };
+        self.broadcast(&policy, true);
+        Ok(())
+    }
+
+    fn broadcast(&mut self, policy: &Policy, finished: bool) -> Arc<v1::PolicyUpdate> {
+        let update = Arc::new(v1::PolicyUpdate {
+            version: Some(self.version.into()),
+            networks: vec![v1::NamedNetwork { name: "policy".into(), model: policy.to_bytes().into() }],
+            values: [("beta".to_owned(), self.curriculum.beta())].into(),
+            stage: self.curriculum.stage(),
+            env_steps: self.progress.env_steps,
+            uniform: self.progress.env_steps < self.config.sac.uniform_steps && self.sac.updates() == 0,
+            finished,
+        });
+        self.metrics.policy_version.set(self.version.counter as i64);
+        self.version.counter += 1;
+        self.hub.publish(Arc::clone(&update));
+        update
+    }
+
+    fn offer(&mut self, policy: Arc<v1::PolicyUpdate>) {
+        self.hub.offer(Evaluation { policy, updates: self.sac.updates() });
+    }
+
+    fn checkpoint(&mut self) {
+        let checkpoint = Checkpoint::take(&self.sac, &self.curriculum, &self.progress);
+        self.checkpoints.write(checkpoint);
+    }
+
+    /// Adds what a model file says of itself.
+    fn describe(&self, mut policy: Policy, beta: f64) -> Policy {
+        for (key, value) in [
+            ("beta", beta.to_string()),
+            ("stage", self.curriculum.stage().to_string()),
+            ("task", "getup".to_owned()),
+            ("character", self.config.character.clone()),
+            ("run", self.config.run.clone()),
+            ("seed", self.config.seed.to_string()),
+            ("env_steps", self.progress.env_steps.to_string()),
+            ("updates", self.sac.updates().to_string()),
+        ] {
+            policy.metadata.insert(key.to_owned(), value);
+        }
+        policy
+    }
+
+    /// Tells hub and metrics where the training stands.
+    fn show(&self) {
+        let (stage, env_steps) = (self.curriculum.stage(), self.progress.env_steps);
+        let stage_env_steps = self.curriculum.stage_steps(env_steps);
+        let stage_limit = self.curriculum.stage_limit().unwrap_or(0);
+        self.metrics.env_steps.set(env_steps as i64);
+        self.metrics.beta.set(self.curriculum.beta());
+        self.metrics.stage.set(i64::from(stage));
+        self.metrics.stage_env_steps.set(stage_env_steps as i64);
+        self.metrics.stage_limit_env_steps.set(stage_limit as i64);
+        self.metrics.evaluations_outstanding.set(self.hub.outstanding() as i64);
+        self.metrics.finished.set(i64::from(self.ending.is_some()));
+        let state = match self.ending {
+            Some(_) => "finished",
+            None if self.sac.updates() == 0 => "waiting",
+            None => "training",
+        };
+        self.hub.set_standing(Standing {
+            state,
+            env_steps,
+            updates: self.sac.updates(),
+            updates_per_second: self.pace.per_second(),
+            stage,
+            beta: self.curriculum.beta(),
+            stage_env_steps,
+            stage_limit,
+            evaluation: self.evaluation,
+        });
+    }
+}
+
+impl Progress {
+    /// Takes the replay's counters: env steps of the run go on through a resumed checkpoint and through a new
+    /// store.
+    fn count(&mut self, counters: &ReplayCounters) {
+        if counters.store != self.store {
+            (self.store, self.store_env_steps) = (counters.store, 0);
+        }
+        self.env_steps += counters.env_steps.saturating_sub(self.store_env_steps);
+        self.store_env_steps = self.store_env_steps.max(counters.env_steps);
+    }
+}
+
+impl Batch {
+    /// The tensors of a minibatch: one copy a column.
+    pub fn from_minibatch(minibatch: &Minibatch) -> Result<Self, TrainError> {
+        let column = |name: &'static str| {
+            let column = minibatch.columns.iter().find(|column| column.name == name);
+            let column = column.ok_or(TrainError::Column(name))?;
+            Ok::<_, TrainError>(Tensor::from_slice(&column.data).view([-1, column.width as i64]))
+        };
+        Ok(Self {
+            observation: column("observation")?,
+            action: column("action")?,
+            reward: column("reward")?.squeeze_dim(1),
+            next_observation: column("next_observation")?,
+            discount: column("discount")?.squeeze_dim(1),
+            beta: column("beta")?,
+        })
+    }
+}

@@ -1,0 +1,41 @@
+//! How fast updates are made, over the last seconds.
+
+use std::time::{Duration, Instant};
+
+/// The window over which the rate is measured.
+const WINDOW: Duration = Duration::from_secs(2);
+
+pub(super) struct Pace {
+    started: Instant,
+    updates: u64,
+    window_start: Instant,
+    window_updates: u64,
+    per_second: f64,
+}
+
+impl Pace {
+    pub(super) fn new(updates: u64) -> Self {
+        let now = Instant::now();
+        Self { started: now, updates, window_start: now, window_updates: updates, per_second: 0.0 }
+    }
+
+    /// Counts an update; true once in a while, when it is time to show something.
+    pub(super) fn count(&mut self) -> bool {
+        self.updates += 1;
+        let elapsed = self.window_start.elapsed();
+        if elapsed >= WINDOW {
+            self.per_second = (self.updates - self.window_updates) as f64 / elapsed.as_secs_f64();
+            (self.window_start, self.window_updates) = (Instant::now(), self.updates);
+        }
+        elapsed >= WINDOW || self.updates.is_multiple_of(100)
+    }
+
+    pub(super) fn per_second(&self) -> f64 {
+        self.per_second
+    }
+
+    /// Since training began in this process.
+    pub(super) fn seconds(&self) -> f64 {
+        self.started.elapsed().as_secs_f64()
+    }
+}
