@@ -3,7 +3,7 @@
 
 use std::ffi::CStr;
 
-use crate::config::Device;
+use crate::config::Device as Configured;
 
 /// Why CUDA was asked for and cannot be had.
 #[derive(Debug, thiserror::Error)]
@@ -17,17 +17,35 @@ pub enum DeviceError {
     /// There is no device.
     #[error("--device cuda: libtorch sees no NVIDIA device (is the driver loaded? see nvidia-smi); use --device cpu")]
     NoDevice,
+    /// It computes nonsense.
+    #[error("libtorch sums four ones to {0}: its installation is broken; remove .native and run `cargo xtask setup`")]
+    Wrong(f64),
 }
 
-/// Opens the device; for CUDA this must come before any other use of libtorch in the process.
-pub fn open_device(device: Device) -> Result<tch::Device, DeviceError> {
-    match device {
-        Device::Cpu => Ok(tch::Device::Cpu),
-        Device::Cuda => {
+pub use tch::Device;
+
+/// Opens the device, and gives libtorch `threads` threads; for CUDA this must come before any other use of libtorch
+/// in the process.
+pub fn open(device: Configured, threads: usize) -> Result<Device, DeviceError> {
+    let opened = match device {
+        Configured::Cpu => Device::Cpu,
+        Configured::Cuda => {
             open_library(c"libtorch_cuda.so")?;
-            if tch::Cuda::is_available() { Ok(tch::Device::Cuda(0)) } else { Err(DeviceError::NoDevice) }
+            if !tch::Cuda::is_available() {
+                return Err(DeviceError::NoDevice);
+            }
+            Device::Cuda(0)
         }
-    }
+    };
+    tch::set_num_threads(threads.try_into().unwrap_or(i32::MAX));
+    Ok(opened)
+}
+
+/// Opens the device and lets it compute something; says what it found.
+pub fn check(device: Configured) -> Result<String, DeviceError> {
+    let opened = open(device, 1)?;
+    let sum = tch::Tensor::ones([2, 2], (tch::Kind::Float, opened)).sum(tch::Kind::Float).double_value(&[]);
+    if sum == 4.0 { Ok(format!("libtorch works on {opened:?}")) } else { Err(DeviceError::Wrong(sum)) }
 }
 
 fn open_library(name: &CStr) -> Result<(), DeviceError> {

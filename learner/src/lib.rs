@@ -22,7 +22,7 @@ mod adam;
 #[cfg(feature = "torch")]
 pub mod checkpoint;
 #[cfg(feature = "torch")]
-mod device;
+pub mod device;
 #[cfg(feature = "torch")]
 pub mod hub;
 #[cfg(feature = "torch")]
@@ -41,5 +41,3 @@ mod statistics;
 #[cfg(feature = "torch")]
 pub mod trainer;
 
-#[cfg(feature = "torch")]
-pub use device::{DeviceError, open_device};

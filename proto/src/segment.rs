@@ -60,7 +60,7 @@ pub enum SegmentError {
     #[error("a segment has {steps} steps: the run's spec allows 1..={limit}; cut it")]
     Steps {
         /// Of the segment.
-        steps: u32,
+        steps: usize,
         /// Of the spec.
         limit: usize,
     },
@@ -70,7 +70,7 @@ pub enum SegmentError {
     )]
     Counts {
         /// Of the segment.
-        steps: u32,
+        steps: usize,
         /// Of the segment.
         first_step: u32,
         /// Of the segment.
@@ -162,9 +162,29 @@ impl Segment {
     /// # Errors
     /// [`SegmentError`] with the first thing that is wrong.
     pub fn parse(wire: v1::Segment, spec: &RunSpec) -> Result<Self, SegmentError> {
-        check_counts(&wire, spec)?;
-        check_end(&wire)?;
-        check_columns(&wire, spec)?;
+        let carried = wire.crc32;
+        let segment = Self::from_wire(wire)?;
+        segment.check_counts(spec)?;
+        segment.check_dimensions(spec)?;
+        let computed = checksum(&segment.columns);
+        if computed != carried {
+            return Err(SegmentError::Checksum { computed, carried });
+        }
+        segment.check_values(spec)?;
+        Ok(segment)
+    }
+
+    /// Checks a segment that was put together by hand, as [`Segment::parse`] does.
+    ///
+    /// # Errors
+    /// [`SegmentError`] with the first thing that is wrong.
+    pub fn check(&self, spec: &RunSpec) -> Result<(), SegmentError> {
+        self.check_counts(spec)?;
+        self.check_dimensions(spec)?;
+        self.check_values(spec)
+    }
+
+    fn from_wire(wire: v1::Segment) -> Result<Self, SegmentError> {
         let (Some(first_version), Some(last_version)) = (wire.first_version, wire.last_version) else {
             return Err(SegmentError::Version);
         };
@@ -206,6 +226,59 @@ impl Segment {
             end: self.end.clone().map(v1::EpisodeEnd::from),
         }
     }
+
+    fn check_counts(&self, spec: &RunSpec) -> Result<(), SegmentError> {
+        let Self { steps, first_step, env_steps, .. } = *self;
+        if self.sequence == 0 {
+            return Err(SegmentError::Sequence);
+        }
+        if !(1..=spec.max_segment_steps).contains(&steps) {
+            return Err(SegmentError::Steps { steps, limit: spec.max_segment_steps });
+        }
+        // A spec's limit fits into 32 bits, and so does `steps`.
+        if env_steps as usize > steps || first_step.checked_add(steps as u32).is_none() {
+            return Err(SegmentError::Counts { steps, first_step, env_steps });
+        }
+        let ends = self.terminal || self.truncated;
+        if ends != self.end.is_some() || (self.terminal && self.truncated) {
+            let (terminal, truncated, end) = (self.terminal, self.truncated, self.end.is_some());
+            return Err(SegmentError::End { terminal, truncated, end });
+        }
+        Ok(())
+    }
+
+    fn check_dimensions(&self, spec: &RunSpec) -> Result<(), SegmentError> {
+        if self.columns.len() != spec.columns.len() {
+            return Err(SegmentError::Columns { columns: self.columns.len(), expected: spec.columns.len() });
+        }
+        for (column, bytes) in spec.columns.iter().zip(&self.columns) {
+            let expected = column.bytes(self.steps);
+            if bytes.len() != expected {
+                let column = column.name.clone();
+                return Err(SegmentError::Dimensions {
+                    column,
+                    steps: self.steps,
+                    bytes: bytes.len(),
+                    expected,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    fn check_values(&self, spec: &RunSpec) -> Result<(), SegmentError> {
+        for (column, bytes) in spec.columns.iter().zip(&self.columns) {
+            if let Some(index) = columns::first_non_finite(bytes) {
+                let value = columns::iter(bytes).nth(index).unwrap_or(f32::NAN);
+                let (row, place) = (index / column.width, index % column.width);
+                return Err(SegmentError::NonFinite { column: column.name.clone(), row, place, value });
+            }
+        }
+        match &self.end {
+            Some(end) if !end.episode_return.is_finite() => Err(SegmentError::Return(end.episode_return)),
+            _ => Ok(()),
+        }
+    }
 }
 
 impl From<v1::EpisodeEnd> for EpisodeEnd {
@@ -237,64 +310,6 @@ fn checksum(columns: &[Bytes]) -> u32 {
         hasher.update(column);
     }
     hasher.finalize()
-}
-
-fn check_counts(wire: &v1::Segment, spec: &RunSpec) -> Result<(), SegmentError> {
-    if wire.sequence == 0 {
-        return Err(SegmentError::Sequence);
-    }
-    if wire.steps == 0 || wire.steps as usize > spec.max_segment_steps {
-        return Err(SegmentError::Steps { steps: wire.steps, limit: spec.max_segment_steps });
-    }
-    if wire.env_steps > wire.steps || wire.first_step.checked_add(wire.steps).is_none() {
-        return Err(SegmentError::Counts {
-            steps: wire.steps,
-            first_step: wire.first_step,
-            env_steps: wire.env_steps,
-        });
-    }
-    Ok(())
-}
-
-fn check_end(wire: &v1::Segment) -> Result<(), SegmentError> {
-    let ends = wire.terminal || wire.truncated;
-    if ends != wire.end.is_some() || (wire.terminal && wire.truncated) {
-        return Err(SegmentError::End {
-            terminal: wire.terminal,
-            truncated: wire.truncated,
-            end: wire.end.is_some(),
-        });
-    }
-    match &wire.end {
-        Some(end) if !end.episode_return.is_finite() => Err(SegmentError::Return(end.episode_return)),
-        _ => Ok(()),
-    }
-}
-
-fn check_columns(wire: &v1::Segment, spec: &RunSpec) -> Result<(), SegmentError> {
-    if wire.columns.len() != spec.columns.len() {
-        return Err(SegmentError::Columns { columns: wire.columns.len(), expected: spec.columns.len() });
-    }
-    let steps = wire.steps as usize;
-    for (column, bytes) in spec.columns.iter().zip(&wire.columns) {
-        let expected = column.bytes(steps);
-        if bytes.len() != expected {
-            let column = column.name.clone();
-            return Err(SegmentError::Dimensions { column, steps, bytes: bytes.len(), expected });
-        }
-    }
-    let computed = checksum(&wire.columns);
-    if computed != wire.crc32 {
-        return Err(SegmentError::Checksum { computed, carried: wire.crc32 });
-    }
-    for (column, bytes) in spec.columns.iter().zip(&wire.columns) {
-        if let Some(index) = columns::first_non_finite(bytes) {
-            let value = columns::iter(bytes).nth(index).unwrap_or(f32::NAN);
-            let (row, place) = (index / column.width, index % column.width);
-            return Err(SegmentError::NonFinite { column: column.name.clone(), row, place, value });
-        }
-    }
-    Ok(())
 }
 
 #[cfg(test)]

@@ -54,10 +54,9 @@ impl Character {
     /// # Errors
     /// [`SimError::Model`] with MuJoCo's own words if it refuses the model.
     pub(crate) fn compile(self, timestep: f64, control_limit: f64) -> Result<MjModel, SimError> {
-        self.spec(timestep, control_limit).and_then(|mut spec| spec.compile()).map_err(|source| SimError::Model {
-            character: self,
-            reason: source.to_string(),
-        })
+        self.spec(timestep, control_limit)
+            .and_then(|mut spec| spec.compile())
+            .map_err(|source| SimError::Model { character: self, reason: source.to_string() })
     }
 
     fn spec(self, timestep: f64, control_limit: f64) -> Result<MjSpec, MjEditError> {

@@ -67,12 +67,19 @@ pub enum ConfigError {
     #[error("task.physics_hz is {0}; use 200 (discover, weaker) or 800 (slower)")]
     PhysicsHz(u32),
     /// An action noise that is negative or not a number.
-    #[error("task.ragdoll_std is {0}; it must be finite and at least 0 (0 falls limp, the paper's text uses 0.1)")]
+    #[error(
+        "task.ragdoll_std is {0}; it must be finite and at least 0 (0 falls limp, the paper's text uses 0.1)"
+    )]
     RagdollStd(f64),
     /// Episodes without a step.
     #[error("task.episode_steps is 0; it must be at least 1 (the paper's is 250)")]
     EpisodeSteps,
+    /// Weights of reset sources that no draw can follow.
+    #[error("the resets' weights are {0:?}; they must be finite and at least 0, and one must be above 0")]
+    Resets(Vec<f64>),
     /// A control limit that is no clamp.
-    #[error("the control limit is {0}; it must be finite and at least 1, the torque limit of the paper's Table 2")]
+    #[error(
+        "the control limit is {0}; it must be finite and at least 1, the torque limit of the paper's Table 2"
+    )]
     ControlLimit(f64),
 }

@@ -1,0 +1,107 @@
+//! The settings of an actor: the `[actor]` table of a run's configuration.
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// How an actor plays and how it sends what it played. The default is the paper's where the paper has a say.
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ActorConfig {
+    /// Names this actor in logs, metrics and `getup status`; part of what its random draws derive from.
+    pub name: String,
+    /// Episodes played at once, over all threads.
+    pub lanes: usize,
+    /// Threads that the lanes are divided over; each evaluates the policy on its own lanes.
+    pub threads: usize,
+    /// Longest segment, in steps: shorter ones reach the replay sooner, longer ones cost less each step.
+    pub segment_steps: usize,
+    /// Segments that may wait for the replay's acknowledgement; then the lanes wait.
+    pub queue_segments: usize,
+    /// Whether the limp steps of falls are stored too (Table 1). They never count as env steps.
+    pub store_limp: bool,
+    /// How long a shutdown may take to send what is queued, in seconds.
+    pub drain_seconds: f64,
+}
+
+impl Default for ActorConfig {
+    fn default() -> Self {
+        Self {
+            name: "actor".to_owned(),
+            lanes: 16,
+            threads: 1,
+            segment_steps: 64,
+            queue_segments: 64,
+            store_limp: true,
+            drain_seconds: 5.0,
+        }
+    }
+}
+
+/// A setting that is out of range.
+#[derive(Clone, PartialEq, Debug, Error)]
+pub enum ConfigError {
+    /// The actor has no name.
+    #[error("actor.name is empty: name the actor, for example \"actor-1\"")]
+    Name,
+    /// A number that must be at least 1.
+    #[error("actor.{0} is 0: it must be at least 1")]
+    Zero(&'static str),
+    /// A thread without a lane.
+    #[error("actor.threads is {threads} and actor.lanes is {lanes}: every thread needs a lane")]
+    Threads {
+        /// Threads asked for.
+        threads: usize,
+        /// Lanes to divide over them.
+        lanes: usize,
+    },
+    /// Not a duration.
+    #[error("actor.drain_seconds is {0}: it must be between 0 and 3600")]
+    Drain(f64),
+}
+
+impl ActorConfig {
+    /// Checks every setting.
+    ///
+    /// # Errors
+    /// The first setting out of range, with its value and the way out.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        if self.name.is_empty() {
+            return Err(ConfigError::Name);
+        }
+        let counts = [
+            ("lanes", self.lanes),
+            ("threads", self.threads),
+            ("segment_steps", self.segment_steps),
+            ("queue_segments", self.queue_segments),
+        ];
+        if let Some((name, _)) = counts.into_iter().find(|(_, count)| *count == 0) {
+            return Err(ConfigError::Zero(name));
+        }
+        if self.threads > self.lanes {
+            return Err(ConfigError::Threads { threads: self.threads, lanes: self.lanes });
+        }
+        if !(0.0..=3600.0).contains(&self.drain_seconds) {
+            return Err(ConfigError::Drain(self.drain_seconds));
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_defaults_are_valid_and_a_setting_out_of_range_is_named() {
+        let refused = |change: &dyn Fn(&mut ActorConfig)| {
+            let mut config = ActorConfig::default();
+            change(&mut config);
+            config.validate().unwrap_err().to_string()
+        };
+        assert_eq!(ActorConfig::default().validate(), Ok(()));
+        assert!(refused(&|c| c.name.clear()).contains("actor.name"));
+        assert!(refused(&|c| c.lanes = 0).contains("actor.lanes is 0"));
+        assert!(refused(&|c| c.threads = 17).contains("actor.threads is 17 and actor.lanes is 16"));
+        assert!(refused(&|c| c.drain_seconds = f64::NAN).contains("actor.drain_seconds is NaN"));
+    }
+}

@@ -1,0 +1,79 @@
+//! How an actor explores: the draw of β̂ (§5) and of actions (App. D).
+
+use getup_policy::squash;
+use rand::Rng;
+use rand_distr::StandardNormal;
+
+/// The draw of an episode's torque limit β̂ around the curriculum's β^i (§5).
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct BetaDraw {
+    /// Standard deviation: 0.04 in the paper.
+    pub std: f64,
+    /// Lower clip, the curriculum's floor: 0.4 in the paper.
+    pub floor: f64,
+    /// Upper clip, the curriculum's β^0: 1 in the paper.
+    pub ceiling: f64,
+}
+
+impl BetaDraw {
+    /// β̂ ~ N(`beta`, std), clipped to [floor, ceiling]. Drawn at an episode's start and kept throughout.
+    pub fn draw(&self, beta: f64, rng: &mut impl Rng) -> f32 {
+        let noise: f64 = rng.sample(StandardNormal);
+        (beta + self.std * noise).clamp(self.floor, self.ceiling) as f32
+    }
+}
+
+/// Samples a = β̂·tanh(u), u ~ N(`mean`, exp(`log_std`)), one number a motor.
+pub fn sample_action(mean: &[f32], log_std: &[f32], beta: f32, rng: &mut impl Rng, action: &mut [f32]) {
+    for ((component, mean), log_std) in action.iter_mut().zip(mean).zip(log_std) {
+        let noise: f32 = rng.sample(StandardNormal);
+        *component = squash(mean + log_std.exp() * noise, beta);
+    }
+}
+
+/// Draws an action uniform in [-β̂, β̂]: how the first steps of a run explore.
+pub fn uniform_action(beta: f32, rng: &mut impl Rng, action: &mut [f32]) {
+    for component in action {
+        *component = rng.random_range(-beta..=beta);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    const DRAW: BetaDraw = BetaDraw { std: 0.04, floor: 0.4, ceiling: 1.0 };
+
+    proptest! {
+        #[test]
+        fn beta_stays_between_the_floor_and_the_ceiling(beta in 0.3_f64..1.2, seed: u64) {
+            let drawn = DRAW.draw(beta, &mut ChaCha8Rng::seed_from_u64(seed));
+            prop_assert!((0.4_f32..=1.0).contains(&drawn));
+        }
+
+        #[test]
+        fn actions_stay_within_beta(
+            mean in prop::array::uniform4(-30_f32..30.0), log_std in -5_f32..2.0, beta in 0.4_f32..2.0, seed: u64
+        ) {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let mut action = [0.0; 4];
+            sample_action(&mean, &[log_std; 4], beta, &mut rng, &mut action);
+            prop_assert!(action.iter().all(|component| component.abs() <= beta));
+            uniform_action(beta, &mut rng, &mut action);
+            prop_assert!(action.iter().all(|component| component.abs() <= beta));
+        }
+    }
+
+    #[test]
+    fn beta_is_normal_with_the_given_spread_where_nothing_clips_it() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let draws: Vec<f64> = (0..20_000).map(|_| f64::from(DRAW.draw(0.7, &mut rng))).collect();
+        let mean = draws.iter().sum::<f64>() / draws.len() as f64;
+        let variance = draws.iter().map(|draw| (draw - mean).powi(2)).sum::<f64>() / draws.len() as f64;
+        assert!((mean - 0.7).abs() < 0.001, "{mean}");
+        assert!((variance.sqrt() - 0.04).abs() < 0.001, "{}", variance.sqrt());
+    }
+}

@@ -1,0 +1,117 @@
+//! Appends segments to a replay over gRPC.
+
+use getup_proto::v1::append_request::Message;
+use getup_proto::v1::replay_client::ReplayClient;
+use getup_proto::v1::{AppendHello, AppendReply, AppendRequest};
+use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment};
+use getup_telemetry::{Backoff, WaitGuard, Waits};
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::UnboundedReceiverStream;
+use tonic::transport::Channel;
+use tonic::{Status, Streaming};
+
+use super::{AddressError, channel, link_error};
+use crate::identity::Identity;
+use crate::link::{LinkError, SegmentWriter};
+
+/// A [`SegmentWriter`] that reconnects with back-off and sends again what was not acknowledged.
+pub struct GrpcReplay {
+    client: ReplayClient<Channel>,
+    peer: String,
+    spec: RunSpec,
+    identity: Identity,
+    waits: Waits,
+    backoff: Backoff,
+    stream: Option<AppendStream>,
+}
+
+/// An append stream that has said hello.
+struct AppendStream {
+    /// Unbounded: what is in it is bounded by what one call of `append` gives.
+    requests: mpsc::UnboundedSender<AppendRequest>,
+    replies: Streaming<AppendReply>,
+    /// The last sequence number that the replay has called durable.
+    durable: u64,
+}
+
+impl GrpcReplay {
+    /// A writer to the replay at `address`, such as `http://replay:7400`. It connects when it first appends.
+    ///
+    /// # Errors
+    /// [`AddressError`] when the address is none.
+    pub fn new(address: &str, spec: RunSpec, identity: Identity, waits: Waits) -> Result<Self, AddressError> {
+        let client = ReplayClient::new(channel(address)?)
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES);
+        let peer = format!("replay at {address}");
+        Ok(Self { client, peer, spec, identity, waits, backoff: Backoff::new(), stream: None })
+    }
+
+    /// Sends what is not durable of `segments`, and returns when all of it is.
+    async fn attempt(&mut self, segments: &[Segment]) -> Result<(), Status> {
+        let mut stream = match self.stream.take() {
+            Some(stream) => stream,
+            None => self.connect().await?,
+        };
+        let last = segments.last().map_or(0, |segment| segment.sequence);
+        for segment in segments.iter().filter(|segment| segment.sequence > stream.durable) {
+            // A stream that has ended says why in its replies.
+            let _ = stream.requests.send(request(Message::Segment(segment.to_wire())));
+        }
+        while stream.durable < last {
+            stream.hear().await?;
+        }
+        self.stream = Some(stream);
+        Ok(())
+    }
+
+    async fn connect(&mut self) -> Result<AppendStream, Status> {
+        let (requests, receiver) = mpsc::unbounded_channel();
+        let hello = AppendHello {
+            spec: Some(self.spec.to_wire()),
+            writer: self.identity.writer,
+            name: self.identity.name.clone(),
+        };
+        let _ = requests.send(request(Message::Hello(hello)));
+        let replies = self.client.append(UnboundedReceiverStream::new(receiver)).await?.into_inner();
+        let mut stream = AppendStream { requests, replies, durable: 0 };
+        stream.hear().await?;
+        tracing::info!(durable_sequence = stream.durable, "connected to the {}", self.peer);
+        Ok(stream)
+    }
+}
+
+impl AppendStream {
+    async fn hear(&mut self) -> Result<(), Status> {
+        let reply = self.replies.message().await?;
+        let reply = reply.ok_or_else(|| Status::unavailable("it ended the stream"))?;
+        self.durable = reply.durable_sequence;
+        Ok(())
+    }
+}
+
+fn request(message: Message) -> AppendRequest {
+    AppendRequest { message: Some(message) }
+}
+
+impl SegmentWriter for GrpcReplay {
+    async fn append(&mut self, segments: Vec<Segment>) -> Result<(), LinkError> {
+        let mut waiting: Option<WaitGuard> = None;
+        loop {
+            let error = match self.attempt(&segments).await {
+                Ok(()) => {
+                    self.backoff.reset();
+                    return Ok(());
+                }
+                Err(status) => link_error(&self.peer, &status),
+            };
+            let LinkError::Unavailable(reason) = error else { return Err(error) };
+            tracing::debug!("cannot append to the {reason}");
+            match &waiting {
+                Some(guard) => guard.set_reason(reason),
+                None => waiting = Some(self.waits.begin("actor_writer", reason)),
+            }
+            tokio::time::sleep(self.backoff.next()).await;
+        }
+    }
+}

@@ -1,0 +1,251 @@
+//! The actor as a role: threads of lanes, the segment queue, heartbeats and reports, until shutdown.
+
+use std::future::pending;
+use std::ops::Range;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use getup_proto::RunSpec;
+use getup_sim::{GetUp, SimError, TaskConfig};
+use getup_telemetry::{Registry, Shutdown, Waits};
+use thiserror::Error;
+use tokio::runtime::Handle;
+use tokio::sync::{mpsc, watch};
+use tokio::task::{JoinError, JoinSet};
+
+use crate::config::{ActorConfig, ConfigError};
+use crate::evaluate::EvaluateError;
+use crate::explore::BetaDraw;
+use crate::identity::Identity;
+use crate::lane_thread::{EvaluationDesk, LaneThread};
+use crate::lanes::{GroupError, LaneSettings};
+use crate::link::{LearnerLink, LinkError, PolicyUpdate, SegmentWriter};
+use crate::metrics::ActorMetrics;
+use crate::office::Office;
+use crate::queue::{QueueInput, QueueOutput, queue};
+
+/// Everything that an actor is made from.
+#[derive(Clone, Debug)]
+pub struct ActorSetup {
+    /// How it plays and sends.
+    pub config: ActorConfig,
+    /// What it plays.
+    pub task: TaskConfig,
+    /// What its segments look like.
+    pub spec: RunSpec,
+    /// Who it is.
+    pub identity: Identity,
+    /// How β̂ is drawn; its ceiling is also the actuators' clamp, where it is above 1.
+    pub beta: BetaDraw,
+    /// Where the states of diverged episodes are kept.
+    pub diverged_folder: PathBuf,
+}
+
+/// Why an actor cannot go on.
+#[derive(Debug, Error)]
+pub enum ActorError {
+    /// A setting of the actor.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// A setting of the task.
+    #[error(transparent)]
+    Sim(#[from] SimError),
+    /// The spec or the policy does not fit the task.
+    #[error(transparent)]
+    Group(#[from] GroupError),
+    /// A leased evaluation cannot be played here.
+    #[error("cannot play a leased evaluation: {0}")]
+    Evaluate(#[from] EvaluateError),
+    /// The replay or the learner refuses this actor.
+    #[error("refused by the {0}")]
+    Refused(LinkError),
+    /// A defect of this program.
+    #[error("a thread of the actor panicked: {0}")]
+    Panicked(#[from] JoinError),
+}
+
+/// Runs an actor until `shutdown`, which then takes up to `drain_seconds`.
+///
+/// It waits for its first policy, and goes on waiting after the last: an actor ends by shutdown alone.
+///
+/// # Errors
+/// [`ActorError`] when it cannot go on; everything it started has ended then.
+///
+/// # Panics
+/// When `registry` has an actor's metrics already.
+pub async fn run<W: SegmentWriter, L: LearnerLink>(
+    setup: ActorSetup,
+    writer: W,
+    link: L,
+    waits: Waits,
+    shutdown: Shutdown,
+    registry: &Registry,
+) -> Result<(), ActorError> {
+    setup.config.validate()?;
+    let metrics = ActorMetrics::new(registry);
+    let stop = StopOnDrop(Shutdown::new());
+    let (slot, updates) = watch::channel(None);
+    let (input, output) = queue(setup.config.queue_segments, metrics.clone());
+    let (lease_sender, leases) = mpsc::channel(1);
+    let (report_sender, reports) = mpsc::unbounded_channel();
+    let control_limit = setup.beta.ceiling.max(1.0);
+    let desk = EvaluationDesk {
+        task: setup.task.clone(),
+        control_limit,
+        leases,
+        reports: report_sender,
+        evaluator: None,
+    };
+    let threads = Threads { waits: &waits, stop: &stop.0, updates: &updates, queue: input };
+    let mut threads = threads.start(&setup, control_limit, desk, &metrics)?;
+    let mut writing = JoinSet::new();
+    writing.spawn(write(writer, output));
+    let office = Office::new(&setup.identity.name, &link, updates, waits, metrics.clone());
+
+    let result = tokio::select! {
+        () = shutdown.wait() => Ok(()),
+        result = first_error(&mut threads) => result,
+        result = first_error(&mut writing) => result,
+        result = subscribe(&link, slot) => result,
+        () = office.send_heartbeats(lease_sender) => Ok(()),
+        () = office.send_reports(reports) => Ok(()),
+    };
+    stop.0.trigger();
+    let result = result.and(first_error_of_all(&mut threads).await);
+    if result.is_ok() {
+        drain(&mut writing, &setup.config, &metrics).await?;
+    }
+    result
+}
+
+/// Whatever way [`run`] ends, its threads do.
+struct StopOnDrop(Shutdown);
+
+impl Drop for StopOnDrop {
+    fn drop(&mut self) {
+        self.0.trigger();
+    }
+}
+
+/// What every thread of lanes gets a share of.
+struct Threads<'a> {
+    waits: &'a Waits,
+    stop: &'a Shutdown,
+    updates: &'a watch::Receiver<Option<Arc<PolicyUpdate>>>,
+    queue: QueueInput,
+}
+
+impl Threads<'_> {
+    fn start(
+        self,
+        setup: &ActorSetup,
+        control_limit: f64,
+        desk: EvaluationDesk,
+        metrics: &ActorMetrics,
+    ) -> Result<JoinSet<Result<(), ActorError>>, SimError> {
+        let settings = LaneSettings {
+            task: Arc::new(GetUp::new(&setup.task, control_limit)?),
+            config: setup.config.clone(),
+            spec: setup.spec.clone(),
+            identity: setup.identity.clone(),
+            beta: setup.beta,
+            diverged_folder: setup.diverged_folder.clone(),
+            metrics: metrics.clone(),
+        };
+        let mut desk = Some(desk);
+        let mut threads = JoinSet::new();
+        for share in shares(setup.config.lanes, setup.config.threads) {
+            let thread = LaneThread {
+                settings: settings.clone(),
+                first_lane: share.start as u32,
+                lanes: share.len(),
+                updates: self.updates.clone(),
+                queue: self.queue.clone(),
+                desk: desk.take(),
+                waits: self.waits.clone(),
+                stop: self.stop.clone(),
+            };
+            threads.spawn_blocking(move || thread.run(&Handle::current()));
+        }
+        Ok(threads)
+    }
+}
+
+/// Divides lanes over threads as evenly as they go.
+fn shares(lanes: usize, threads: usize) -> impl Iterator<Item = Range<usize>> {
+    (0..threads).map(move |thread| lanes * thread / threads..lanes * (thread + 1) / threads)
+}
+
+/// Returns with the first task that fails; never, where none does.
+async fn first_error(tasks: &mut JoinSet<Result<(), ActorError>>) -> Result<(), ActorError> {
+    while let Some(ended) = tasks.join_next().await {
+        ended??;
+    }
+    pending().await
+}
+
+/// Waits for all tasks, and returns the first failure among them.
+async fn first_error_of_all(tasks: &mut JoinSet<Result<(), ActorError>>) -> Result<(), ActorError> {
+    let mut result = Ok(());
+    while let Some(ended) = tasks.join_next().await {
+        result = result.and(ended.map_err(ActorError::from).flatten());
+    }
+    result
+}
+
+async fn subscribe(link: &impl LearnerLink, slot: crate::link::PolicySlot) -> Result<(), ActorError> {
+    link.subscribe(slot).await.map_err(ActorError::Refused)?;
+    pending().await
+}
+
+/// Numbers the segments and appends them, all that are there at a time.
+async fn write(mut writer: impl SegmentWriter, mut queue: QueueOutput) -> Result<(), ActorError> {
+    let mut sequence = 0;
+    loop {
+        let mut segments = queue.take().await;
+        let count = segments.len();
+        if count == 0 {
+            return Ok(());
+        }
+        for segment in &mut segments {
+            sequence += 1;
+            segment.sequence = sequence;
+        }
+        writer.append(segments).await.map_err(ActorError::Refused)?;
+        queue.acknowledge(count);
+    }
+}
+
+/// Gives the writer its time to send what the lanes left.
+async fn drain(
+    writing: &mut JoinSet<Result<(), ActorError>>,
+    config: &ActorConfig,
+    metrics: &ActorMetrics,
+) -> Result<(), ActorError> {
+    let limit = Duration::from_secs_f64(config.drain_seconds);
+    match tokio::time::timeout(limit, first_error_of_all(writing)).await {
+        Ok(result) => result,
+        Err(_) => {
+            let left = metrics.unacknowledged_segments.get();
+            tracing::warn!("{left} segments are lost: the replay did not take them within {limit:?}");
+            Ok(())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn every_lane_belongs_to_one_thread_and_no_thread_is_without(threads in 1usize..20, more in 0usize..50) {
+            let lanes = threads + more;
+            let shares: Vec<_> = shares(lanes, threads).collect();
+            prop_assert!(shares.iter().all(|share| !share.is_empty()));
+            prop_assert_eq!(shares.into_iter().flatten().collect::<Vec<_>>(), (0..lanes).collect::<Vec<_>>());
+        }
+    }
+}

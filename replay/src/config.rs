@@ -1,0 +1,153 @@
+//! The settings of a replay: [`ReplayConfig`].
+
+use getup_proto::RunSpec;
+use serde::{Deserialize, Serialize};
+
+/// What an acknowledged segment survives.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Sync {
+    /// The process being killed: the kernel has the data.
+    #[default]
+    Process,
+    /// Also a power loss: the disk has the data (`fsync` before every acknowledgement).
+    Data,
+}
+
+/// The settings of a replay.
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ReplayConfig {
+    /// Where the service listens, as `host:port`.
+    pub listen: String,
+    /// Transitions that can be sampled at once; the oldest go first.
+    pub capacity: usize,
+    /// Env steps that must have come before the first sample; limp steps do not count.
+    pub min_size: u64,
+    /// Transitions sampled per env step inserted, kept within a band: whoever is ahead waits. One update of batch
+    /// 256 a step is 256. Without it, nobody waits once `min_size` is reached.
+    pub samples_per_insert: Option<f64>,
+    /// Half the width of that band, in sampled transitions. Without it: a tenth of `min_size` ×
+    /// `samples_per_insert`, and at least what two of the longest segments allow.
+    pub error_buffer: Option<f64>,
+    /// What an acknowledged segment survives.
+    pub sync: Sync,
+}
+
+impl Default for ReplayConfig {
+    fn default() -> Self {
+        Self {
+            listen: "127.0.0.1:7301".to_owned(),
+            capacity: 1_000_000,
+            min_size: 1_000,
+            samples_per_insert: None,
+            error_buffer: None,
+            sync: Sync::Process,
+        }
+    }
+}
+
+/// Why a configuration is refused.
+#[derive(Clone, PartialEq, Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// `min_size` out of range.
+    #[error("replay.min_size is {min_size}: it must lie in 1..=replay.capacity ({capacity})")]
+    MinSize {
+        /// As configured.
+        min_size: u64,
+        /// As configured.
+        capacity: usize,
+    },
+    /// `capacity` out of range.
+    #[error(
+        "replay.capacity is {capacity}: it must lie in {min}..={max} (two of the longest segments, and 2^31)"
+    )]
+    Capacity {
+        /// As configured.
+        capacity: usize,
+        /// Two of the longest segments.
+        min: usize,
+        /// [`MAX_CAPACITY`].
+        max: usize,
+    },
+    /// `samples_per_insert` is not a positive number.
+    #[error("replay.samples_per_insert is {0}: it must be positive; leave it out for no limit")]
+    SamplesPerInsert(f64),
+    /// `error_buffer` is so narrow that writers and samplers would wait for each other.
+    #[error(
+        "replay.error_buffer is {error_buffer}: it must be at least {min}, samples_per_insert times the longest \
+         segment, or one segment would overshoot the band; raise it, or leave it out"
+    )]
+    ErrorBuffer {
+        /// As configured.
+        error_buffer: f64,
+        /// The least that works.
+        min: f64,
+    },
+}
+
+/// The largest capacity, in transitions.
+pub const MAX_CAPACITY: usize = 1 << 31;
+
+impl ReplayConfig {
+    /// Checks what can be checked without a spec.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the first setting that is out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        self.check(1)
+    }
+
+    /// Checks everything, for a run of this spec.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the first setting that is out of range.
+    pub fn validate_for(&self, spec: &RunSpec) -> Result<(), ConfigError> {
+        self.check(spec.max_segment_steps)
+    }
+
+    fn check(&self, max_segment_steps: usize) -> Result<(), ConfigError> {
+        let min = 2 * max_segment_steps;
+        if !(min..=MAX_CAPACITY).contains(&self.capacity) {
+            return Err(ConfigError::Capacity { capacity: self.capacity, min, max: MAX_CAPACITY });
+        }
+        if !(1..=self.capacity as u64).contains(&self.min_size) {
+            return Err(ConfigError::MinSize { min_size: self.min_size, capacity: self.capacity });
+        }
+        let Some(samples_per_insert) = self.samples_per_insert else { return Ok(()) };
+        if !(samples_per_insert.is_finite() && samples_per_insert > 0.0) {
+            return Err(ConfigError::SamplesPerInsert(samples_per_insert));
+        }
+        let min = samples_per_insert * max_segment_steps as f64;
+        match self.error_buffer {
+            Some(error_buffer) if !(error_buffer.is_finite() && error_buffer >= min) => {
+                Err(ConfigError::ErrorBuffer { error_buffer, min })
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_setting_out_of_range_is_refused_by_name() {
+        let refused = |change: &dyn Fn(&mut ReplayConfig)| {
+            let mut config = ReplayConfig::default();
+            change(&mut config);
+            config.check(64).expect_err("a setting is out of range").to_string()
+        };
+        assert!(ReplayConfig::default().check(64).is_ok());
+        assert!(refused(&|c| c.capacity = 127).contains("replay.capacity is 127"));
+        assert!(refused(&|c| c.min_size = 0).contains("replay.min_size is 0"));
+        assert!(refused(&|c| c.min_size = 1_000_001).contains("replay.min_size is 1000001"));
+        assert!(refused(&|c| c.samples_per_insert = Some(-1.0)).contains("samples_per_insert is -1"));
+        let narrow = refused(&|c| {
+            c.samples_per_insert = Some(256.0);
+            c.error_buffer = Some(1000.0);
+        });
+        assert!(narrow.contains("error_buffer is 1000") && narrow.contains("at least 16384"), "{narrow}");
+    }
+}

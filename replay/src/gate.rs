@@ -1,0 +1,269 @@
+//! Where writers and samplers wait for each other: [`Gate`], the rate limiter with its doors.
+//!
+//! A wait can be cancelled, and can say why it lasts: `812 of 1,000 transitions; actor-3 silent for 14 s`.
+
+use crate::limiter::{Blocked, Limiter};
+use getup_telemetry::{Shutdown, WaitGuard, Waits};
+use std::collections::HashMap;
+use std::fmt::Write;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+use tokio::sync::watch;
+
+/// How often a wait looks whether it was cancelled.
+const CANCEL_TICK: Duration = Duration::from_millis(50);
+/// How often a wait's reason is brought up to date.
+const REASON_TICK: Duration = Duration::from_secs(1);
+/// A peer that was silent for this long is named in the reason.
+const SILENCE: Duration = Duration::from_secs(3);
+/// Peers that are remembered; beyond, the longest silent is forgotten.
+const MOST_PEERS: usize = 4096;
+
+/// The limiter, and everybody who waits at it.
+#[derive(Debug)]
+pub(crate) struct Gate {
+    inner: Mutex<Inner>,
+    /// For threads: the limiter has moved.
+    moved: Condvar,
+    /// The same for tasks.
+    moved_tasks: watch::Sender<()>,
+    waits: Waits,
+}
+
+#[derive(Debug)]
+struct Inner {
+    limiter: Limiter,
+    writers: HashMap<u64, Peer>,
+    samplers: HashMap<u64, Peer>,
+}
+
+/// Who is on the other side, and when it was last heard of.
+#[derive(Clone, Debug)]
+pub(crate) struct Peer {
+    pub(crate) name: String,
+    pub(crate) heard: Instant,
+    /// Open streams.
+    pub(crate) connections: usize,
+}
+
+/// Room for an insert that is under way; given back when dropped.
+#[derive(Debug)]
+pub(crate) struct Permit {
+    gate: Arc<Gate>,
+    env_steps: u64,
+}
+
+impl Drop for Permit {
+    fn drop(&mut self) {
+        self.gate.lock().limiter.release(self.env_steps);
+        self.gate.wake();
+    }
+}
+
+impl Gate {
+    pub(crate) fn new(limiter: Limiter, waits: Waits) -> Arc<Self> {
+        let inner = Inner { limiter, writers: HashMap::new(), samplers: HashMap::new() };
+        let (moved_tasks, _) = watch::channel(());
+        Arc::new(Self { inner: Mutex::new(inner), moved: Condvar::new(), moved_tasks, waits })
+    }
+
+    /// What the limiter says now.
+    pub(crate) fn limiter(&self) -> Limiter {
+        self.lock().limiter.clone()
+    }
+
+    /// Counts env steps that are durable and can be sampled.
+    pub(crate) fn insert(&self, env_steps: u64) {
+        self.lock().limiter.insert(env_steps);
+        self.wake();
+    }
+
+    /// Counts a sample, if it need not wait; `count` is told the new total before anybody else can sample.
+    pub(crate) fn try_sample<E>(
+        &self,
+        batch: u64,
+        count: impl FnOnce(u64) -> Result<(), E>,
+    ) -> Result<bool, E> {
+        let mut inner = self.lock();
+        if inner.limiter.blocks_sample(batch).is_some() {
+            return Ok(false);
+        }
+        count(inner.limiter.samples() + batch)?;
+        inner.limiter.sample(batch);
+        drop(inner);
+        self.wake();
+        Ok(true)
+    }
+
+    /// Waits until a sample of this size might be let through. False when `shutdown` or `patience` ends the wait.
+    pub(crate) fn wait_to_sample(&self, batch: u64, patience: Duration, shutdown: &Shutdown) -> bool {
+        let give_up = Instant::now() + patience;
+        let mut wait = None;
+        let mut inner = self.lock();
+        while let Some(blocked) = inner.limiter.blocks_sample(batch) {
+            let left = give_up.saturating_duration_since(Instant::now());
+            if left.is_zero() || shutdown.is_triggered() {
+                return false;
+            }
+            self.explain(&mut wait, "sampler", || inner.reason(&blocked, &inner.writers));
+            let tick = left.min(CANCEL_TICK);
+            inner = self.moved.wait_timeout(inner, tick).unwrap_or_else(PoisonError::into_inner).0;
+        }
+        true
+    }
+
+    /// Room for an insert, if it need not wait.
+    pub(crate) fn try_admit(self: &Arc<Self>, env_steps: u64) -> Option<Permit> {
+        self.lock().try_admit(env_steps).ok()?;
+        Some(Permit { gate: self.clone(), env_steps })
+    }
+
+    /// Waits for room for an insert, on a thread. None when `shutdown` ends the wait.
+    pub(crate) fn admit(self: &Arc<Self>, env_steps: u64, shutdown: &Shutdown) -> Option<Permit> {
+        let mut wait = None;
+        let mut inner = self.lock();
+        while let Err(blocked) = inner.try_admit(env_steps) {
+            if shutdown.is_triggered() {
+                return None;
+            }
+            self.explain(&mut wait, "writer", || inner.reason(&blocked, &inner.samplers));
+            inner = self.moved.wait_timeout(inner, CANCEL_TICK).unwrap_or_else(PoisonError::into_inner).0;
+        }
+        drop(inner);
+        Some(Permit { gate: self.clone(), env_steps })
+    }
+
+    /// Waits for room for an insert, in a task that whoever shuts down drops.
+    pub(crate) async fn admit_task(self: &Arc<Self>, env_steps: u64) -> Permit {
+        let mut moved = self.moved_tasks.subscribe();
+        let mut wait = None;
+        loop {
+            {
+                let mut inner = self.lock();
+                match inner.try_admit(env_steps) {
+                    Ok(()) => return Permit { gate: self.clone(), env_steps },
+                    Err(blocked) => {
+                        self.explain(&mut wait, "writer", || inner.reason(&blocked, &inner.samplers));
+                    }
+                }
+            }
+            // The sender lives in `self`; a wait that times out only refreshes its reason.
+            let _ = tokio::time::timeout(REASON_TICK, moved.changed()).await;
+        }
+    }
+
+    /// A writer has come.
+    pub(crate) fn writer_came(&self, writer: u64, name: &str) {
+        came(&mut self.lock().writers, writer, name);
+    }
+
+    /// A writer's segment has come.
+    pub(crate) fn heard_writer(&self, writer: u64) {
+        if let Some(peer) = self.lock().writers.get_mut(&writer) {
+            peer.heard = Instant::now();
+        }
+    }
+
+    /// A writer's stream has ended.
+    pub(crate) fn writer_went(&self, writer: u64) {
+        if let Some(peer) = self.lock().writers.get_mut(&writer) {
+            peer.connections -= 1;
+        }
+    }
+
+    /// A sampler has come.
+    pub(crate) fn sampler_came(&self, sampler: u64, name: &str) {
+        came(&mut self.lock().samplers, sampler, name);
+    }
+
+    /// A sampler took a minibatch or asked for one.
+    pub(crate) fn heard_sampler(&self, sampler: u64) {
+        if let Some(peer) = self.lock().samplers.get_mut(&sampler) {
+            peer.heard = Instant::now();
+        }
+    }
+
+    /// A sampler has gone for good: a new one has another number.
+    pub(crate) fn sampler_went(&self, sampler: u64) {
+        self.lock().samplers.remove(&sampler);
+    }
+
+    /// The writers that are remembered.
+    pub(crate) fn writers(&self) -> Vec<(u64, Peer)> {
+        self.lock().writers.iter().map(|(&writer, peer)| (writer, peer.clone())).collect()
+    }
+
+    /// What the longest wait at this gate waits for; empty where nobody waits.
+    pub(crate) fn waiting(&self) -> String {
+        let mut waits = self.waits.current().into_iter();
+        waits
+            .find(|wait| matches!(wait.what, "sampler" | "writer"))
+            .map_or_else(String::new, |wait| wait.to_string())
+    }
+
+    fn explain(
+        &self,
+        wait: &mut Option<(WaitGuard, Instant)>,
+        what: &'static str,
+        reason: impl FnOnce() -> String,
+    ) {
+        match wait {
+            Some((_, updated)) if updated.elapsed() < REASON_TICK => {}
+            Some((guard, updated)) => {
+                guard.set_reason(reason());
+                *updated = Instant::now();
+            }
+            None => *wait = Some((self.waits.begin(what, reason()), Instant::now())),
+        }
+    }
+
+    fn wake(&self) {
+        self.moved.notify_all();
+        self.moved_tasks.send_replace(());
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        // Counters are whole after every statement: a panic elsewhere does not spoil them.
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Inner {
+    fn try_admit(&mut self, env_steps: u64) -> Result<(), Blocked> {
+        if let Some(blocked) = self.limiter.blocks_insert(env_steps) {
+            return Err(blocked);
+        }
+        self.limiter.reserve(env_steps);
+        Ok(())
+    }
+
+    /// Why somebody waits for `others`.
+    fn reason(&self, blocked: &Blocked, others: &HashMap<u64, Peer>) -> String {
+        let mut reason = blocked.to_string();
+        // The one heard of last: if it is silent, all are.
+        match others.values().max_by_key(|peer| peer.heard) {
+            None => {
+                let nobody =
+                    if matches!(blocked, Blocked::InsertsAhead { .. }) { "sampler" } else { "writer" };
+                let _ = write!(reason, "; no {nobody} has come");
+            }
+            Some(peer) if peer.heard.elapsed() >= SILENCE => {
+                let _ = write!(reason, "; {} silent for {} s", peer.name, peer.heard.elapsed().as_secs());
+            }
+            Some(_) => {}
+        }
+        reason
+    }
+}
+
+fn came(peers: &mut HashMap<u64, Peer>, id: u64, name: &str) {
+    let connections = peers.get(&id).map_or(0, |peer| peer.connections) + 1;
+    peers.insert(id, Peer { name: name.to_owned(), heard: Instant::now(), connections });
+    if peers.len() > MOST_PEERS {
+        let silent =
+            peers.iter().filter(|(_, peer)| peer.connections == 0).min_by_key(|(_, peer)| peer.heard);
+        if let Some(id) = silent.map(|(&id, _)| id) {
+            peers.remove(&id);
+        }
+    }
+}

@@ -1,0 +1,103 @@
+//! From drawn rows to contiguous columns, with n-step returns.
+//!
+//! For a transition that begins at step t and spans k steps of one episode,
+//!
+//! ```text
+//! reward   = Σ γⁱ · r(t+i),  i = 0 … k−1
+//! discount = γᵏ, or 0 if step t+k−1 ended in a terminal state
+//! ```
+//!
+//! k is n, or less where the episode ends or the ring does not hold what follows. So a one-step target is
+//! `reward + discount × V(next)` whatever n is. The sum runs over neighbouring segments of the episode.
+
+use crate::minibatch::{MinibatchColumn, SampleOptions};
+use crate::ring::{LayoutColumn, Ring, Row};
+use crate::sampler::Sampler;
+use getup_proto::{Rows, columns};
+use std::ops::Range;
+
+/// A transition in the ring, and what its n steps amount to.
+#[derive(Clone, Copy, PartialEq, Debug)]
+struct Transition {
+    /// Slot of the row where it begins.
+    begin: usize,
+    /// Slot of the row where it ends.
+    end: usize,
+    reward: f32,
+    discount: f32,
+}
+
+/// Draws a minibatch's transitions and copies them into columns, in the order of [`crate::Minibatch`].
+///
+/// # Panics
+/// If the ring is empty.
+pub(crate) fn gather(ring: &Ring, sampler: &mut Sampler, options: &SampleOptions) -> Vec<MinibatchColumn> {
+    let reward = ring.layout().columns.iter().find(|column| column.name == columns::REWARD);
+    let reward = reward.map(|column| column.at.start);
+    let transitions: Vec<Transition> = (0..options.batch)
+        .map(|_| span(ring, sampler.draw(ring), reward, options.n_step, options.gamma))
+        .collect();
+
+    let layout = &ring.layout().columns;
+    let mut gathered: Vec<MinibatchColumn> = layout
+        .iter()
+        .map(|column| match reward {
+            Some(at) if at == column.at.start => single(columns::REWARD, &transitions, |t| t.reward),
+            _ => copy(ring, column.name.clone(), &column.at, transitions.iter().map(|t| t.begin)),
+        })
+        .collect();
+    let with_next = |column: &&LayoutColumn| column.rows == Rows::StepsPlusOne;
+    gathered.extend(layout.iter().filter(with_next).map(|column| {
+        let name = format!("{}{}", columns::NEXT_PREFIX, column.name);
+        copy(ring, name, &column.at, transitions.iter().map(|t| t.end))
+    }));
+    gathered.push(single(columns::DISCOUNT, &transitions, |t| t.discount));
+    gathered
+}
+
+/// Follows up to `n` steps of the episode from the row `begin`; `reward` is the place of the reward in a row.
+fn span(ring: &Ring, begin: Row, reward: Option<usize>, n: usize, gamma: f32) -> Transition {
+    let mut entry = ring.entry_of(begin);
+    let begin_slot = ring.slot(begin);
+    let mut slot = begin_slot;
+    let mut steps_left = entry.steps_after(begin);
+    let mut transition = Transition { begin: begin_slot, end: begin_slot, reward: 0.0, discount: 1.0 };
+    for step in 1..=n {
+        if let Some(place) = reward {
+            transition.reward += transition.discount * ring.values(slot)[place];
+        }
+        transition.discount *= gamma;
+        slot = ring.slot_after(slot);
+        transition.end = slot;
+        steps_left -= 1;
+        if steps_left > 0 || step == n {
+            continue;
+        }
+        // The row where a segment ends is the one where its continuation begins.
+        let Some(continuation) = ring.continuation(entry) else { break };
+        entry = continuation;
+        slot = ring.slot(entry.first_row);
+        steps_left = entry.steps;
+    }
+    if steps_left == 0 && entry.terminal {
+        transition.discount = 0.0;
+    }
+    transition
+}
+
+fn copy(ring: &Ring, name: String, at: &Range<usize>, slots: impl Iterator<Item = usize>) -> MinibatchColumn {
+    let width = at.len();
+    let mut data = Vec::with_capacity(slots.size_hint().0 * width);
+    for slot in slots {
+        data.extend_from_slice(&ring.values(slot)[at.clone()]);
+    }
+    MinibatchColumn { name, width, data }
+}
+
+fn single(name: &str, transitions: &[Transition], value: impl Fn(&Transition) -> f32) -> MinibatchColumn {
+    MinibatchColumn { name: name.to_owned(), width: 1, data: transitions.iter().map(value).collect() }
+}
+
+#[cfg(test)]
+#[path = "gather_tests.rs"]
+mod tests;

@@ -1,0 +1,113 @@
+use super::*;
+use crate::fixtures::{self, Ending, Part};
+use getup_proto::Segment;
+use proptest::prelude::*;
+
+const GAMMA: f32 = 0.9;
+
+/// Episodes of several lanes, interleaved segment by segment.
+fn episodes(lengths: &[(usize, Ending)], cut: usize) -> Vec<Segment> {
+    let spec = fixtures::spec(8);
+    let mut parts = Vec::new();
+    for (lane, &(length, ending)) in lengths.iter().enumerate() {
+        for first_step in (0..length).step_by(cut) {
+            let steps = cut.min(length - first_step);
+            let ending = if first_step + steps == length { ending } else { Ending::None };
+            let (lane, first_step) = (lane as u32, first_step as u32);
+            parts.push(Part { writer: 1, sequence: 0, lane, episode: 0, first_step, steps, ending });
+        }
+    }
+    parts.sort_by_key(|part| (part.first_step, part.lane));
+    (1..).zip(parts).map(|(sequence, part)| Part { sequence, ..part }.build(&spec)).collect()
+}
+
+/// n-step return, its discount and where it ends, straight from the definition: step `t` of an episode of which
+/// the ring holds the steps before `held`.
+fn reference(lane: u32, t: usize, n: usize, held: usize, terminal: bool) -> (f32, f32, usize) {
+    let end = (t + n).min(held);
+    let reward = |step| fixtures::value(1, lane, 0, step, 2, 0) as f64;
+    let total: f64 = (t..end).map(|step| (GAMMA as f64).powi((step - t) as i32) * reward(step)).sum();
+    let discount = if terminal && end == held { 0.0 } else { (GAMMA as f64).powi((end - t) as i32) };
+    (total as f32, discount as f32, end)
+}
+
+proptest! {
+    #[test]
+    fn n_step_transitions_equal_a_straightforward_reference(
+        lengths in prop::collection::vec((1usize..40, prop_oneof![
+            Just(Ending::None), Just(Ending::Terminal), Just(Ending::Truncated)]), 1..6),
+        cut in 1usize..=8,
+        n in 1usize..=20,
+    ) {
+        let segments = episodes(&lengths, cut);
+        let mut ring = Ring::new(&fixtures::spec(8), 1000);
+        let mut steps = Vec::new();
+        for segment in &segments {
+            ring.push(segment);
+            steps.extend((0..=segment.steps).map(|i| (segment.lane, segment.first_step as usize + i)));
+        }
+        for (number, (lane, t)) in (0..).zip(steps) {
+            let row = ring.nth_row(number);
+            if !ring.begins_transition(row) {
+                continue;
+            }
+            let (length, ending) = lengths[lane as usize];
+            let got = span(&ring, row, Some(5), n, GAMMA);
+            let (reward, discount, end) = reference(lane, t, n, length, ending == Ending::Terminal);
+            prop_assert!((got.reward - reward).abs() < 1e-5);
+            prop_assert!((got.discount - discount).abs() < 1e-6);
+            prop_assert_eq!(ring.values(got.begin)[0], fixtures::value(1, lane, 0, t, 0, 0));
+            prop_assert_eq!(ring.values(got.end)[0], fixtures::value(1, lane, 0, end, 0, 0));
+        }
+    }
+}
+
+#[test]
+fn a_transition_is_shorter_while_the_next_segment_has_not_come_and_whole_once_it_has() {
+    let segments = episodes(&[(16, Ending::Truncated)], 8);
+    let mut ring = Ring::new(&fixtures::spec(8), 100);
+    ring.push(&segments[0]);
+    let row = ring.nth_row(6);
+    let short = span(&ring, row, Some(5), 4, GAMMA);
+    assert_eq!(
+        (short.discount, ring.values(short.end)[0]),
+        (GAMMA * GAMMA, fixtures::value(1, 0, 0, 8, 0, 0))
+    );
+    ring.push(&segments[1]);
+    let whole = span(&ring, row, Some(5), 4, GAMMA);
+    assert_eq!(ring.values(whole.end)[0], fixtures::value(1, 0, 0, 10, 0, 0));
+}
+
+#[test]
+fn columns_come_in_the_order_of_the_spec_then_the_next_states_then_the_discount() {
+    let mut ring = Ring::new(&fixtures::spec(8), 100);
+    for segment in episodes(&[(30, Ending::Terminal), (20, Ending::Truncated)], 7) {
+        ring.push(&segment);
+    }
+    let options = SampleOptions { batch: 64, n_step: 1, gamma: GAMMA, seed: 0 };
+    let columns = gather(&ring, &mut Sampler::uniform(5), &options);
+    let shape: Vec<_> = columns.iter().map(|c| (c.name.as_str(), c.width, c.data.len())).collect();
+    let expected = [
+        ("observation", 3, 192),
+        ("action", 2, 128),
+        ("reward", 1, 64),
+        ("beta", 1, 64),
+        ("next_observation", 3, 192),
+        ("discount", 1, 64),
+    ];
+    assert_eq!(shape, expected);
+    // Every row is one transition: its parts belong together.
+    for i in 0..64 {
+        let same = |&(lane, t): &(u32, usize)| {
+            let value = |step, column, place| fixtures::value(1, lane, 0, step, column, place);
+            columns[0].data[3 * i..3 * i + 3] == [value(t, 0, 0), value(t, 0, 1), value(t, 0, 2)]
+                && columns[1].data[2 * i..2 * i + 2] == [value(t, 1, 0), value(t, 1, 1)]
+                && columns[2].data[i] == value(t, 2, 0)
+                && columns[3].data[i] == value(0, 3, 0)
+                && columns[4].data[3 * i] == value(t + 1, 0, 0)
+                && columns[5].data[i] == if lane == 0 && t == 29 { 0.0 } else { GAMMA }
+        };
+        let all = (0..30).map(|t| (0, t)).chain((0..20).map(|t| (1, t)));
+        assert_eq!(all.filter(same).count(), 1);
+    }
+}

@@ -1,0 +1,67 @@
+//! `store.json`: which format a store has, whose transitions it holds, and its name.
+//!
+//! It lies beside sled's files, so that any later version can read it before it touches them.
+
+use crate::error::StoreError;
+use getup_proto::RunSpec;
+use rand::Rng;
+use serde::{Deserialize, Serialize};
+use std::fs::{self, File};
+use std::io::Write;
+use std::path::Path;
+
+/// The format that this version reads and writes.
+pub(crate) const FORMAT: u64 = 1;
+const FILE: &str = "store.json";
+
+/// The content of `store.json`.
+#[derive(Clone, PartialEq, Eq, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Manifest {
+    format: u64,
+    /// Names the store; drawn at its creation, never 0.
+    pub(crate) store: u64,
+    spec: RunSpec,
+}
+
+impl Manifest {
+    /// Of a new store.
+    pub(crate) fn new(spec: &RunSpec) -> Self {
+        Self { format: FORMAT, store: rand::rng().random_range(1..=u64::MAX), spec: spec.clone() }
+    }
+
+    /// Of the store in `dir`, where there is one; it must have this format and hold transitions of `spec`.
+    pub(crate) fn read(dir: &Path, spec: &RunSpec) -> Result<Option<Self>, StoreError> {
+        let path = dir.join(FILE);
+        if !path.try_exists().map_err(StoreError::io("read", &path))? {
+            return Ok(None);
+        }
+        let text = fs::read(&path).map_err(StoreError::io("read", &path))?;
+        let damaged =
+            |error: serde_json::Error| StoreError::damaged(dir, format!("{FILE} cannot be read ({error})"));
+        let value: serde_json::Value = serde_json::from_slice(&text).map_err(damaged)?;
+        match value["format"].as_u64() {
+            Some(FORMAT) => {}
+            Some(found) => return Err(StoreError::Format { dir: dir.to_owned(), found, ours: FORMAT }),
+            None => return Err(StoreError::damaged(dir, format!("{FILE} names no format"))),
+        }
+        let manifest: Self = serde_json::from_value(value).map_err(damaged)?;
+        spec.check_same(&manifest.spec)
+            .map_err(|source| StoreError::OtherRun { dir: dir.to_owned(), source })?;
+        Ok(Some(manifest))
+    }
+
+    /// Writes it under a temporary name, then renames: it is there whole, or not at all.
+    pub(crate) fn write(&self, dir: &Path) -> Result<(), StoreError> {
+        let (path, temporary) = (dir.join(FILE), dir.join("store.json.new"));
+        let text = serde_json::to_vec_pretty(self).expect("a manifest is plain data");
+        let write = || {
+            let mut file = File::create(&temporary)?;
+            file.write_all(&text)?;
+            file.sync_all()?;
+            fs::rename(&temporary, &path)?;
+            File::open(dir)?.sync_all()
+        };
+        write().map_err(StoreError::io("write", &path))
+    }
+}

@@ -1,0 +1,173 @@
+use super::*;
+use crate::fixtures;
+use proptest::prelude::*;
+use tempfile::TempDir;
+
+fn config(capacity: usize) -> ReplayConfig {
+    ReplayConfig { capacity, min_size: 1, ..ReplayConfig::default() }
+}
+
+/// Opens a log and collects what it hands on.
+fn open(dir: &Path, spec: &RunSpec, capacity: usize) -> Result<(Log, Vec<Segment>), StoreError> {
+    let mut segments = Vec::new();
+    let log = Log::open(dir, spec, &config(capacity), |segment| segments.push(segment.clone()))?;
+    Ok((log, segments))
+}
+
+/// A log of `count` commits of one segment each, closed.
+fn written(dir: &Path, spec: &RunSpec, count: u64) -> Vec<Segment> {
+    let (mut log, _) = open(dir, spec, 10_000).unwrap();
+    let segments: Vec<_> = (1..=count).map(|sequence| fixtures::segment(spec, 1, sequence, 64)).collect();
+    for segment in &segments {
+        log.append(vec![segment.clone()]).unwrap();
+    }
+    segments
+}
+
+#[test]
+fn what_was_appended_is_there_after_a_restart_in_order_and_once() {
+    let (dir, spec) = (TempDir::new().unwrap(), fixtures::get_up_spec());
+    let segments = written(dir.path(), &spec, 30);
+    let (mut log, found) = open(dir.path(), &spec, 10_000).unwrap();
+    assert_eq!(found, segments);
+    assert_eq!((log.state().segments, log.state().transitions, log.durable(1)), (30, 1920, 30));
+    assert_eq!(log.append(segments[10..].to_vec()).unwrap(), []);
+    let (_, again) = {
+        drop(log);
+        open(dir.path(), &spec, 10_000).unwrap()
+    };
+    assert_eq!(again, segments);
+}
+
+#[test]
+fn eviction_drops_the_oldest_keeps_the_capacity_and_forgets_no_writer() {
+    let (dir, spec) = (TempDir::new().unwrap(), fixtures::spec(8));
+    let (mut log, _) = open(dir.path(), &spec, 256).unwrap();
+    log.append(vec![fixtures::segment(&spec, 77, 5, 8)]).unwrap();
+    for sequence in 1..=400 {
+        log.append(vec![fixtures::segment(&spec, 1, sequence, 8)]).unwrap();
+    }
+    assert!(log.generations.len() <= 18, "{} generations", log.generations.len());
+    // Both writers' first segments are long gone, and are not taken again.
+    let again = vec![fixtures::segment(&spec, 77, 5, 8), fixtures::segment(&spec, 1, 1, 8)];
+    assert_eq!(log.append(again.clone()).unwrap(), []);
+    drop(log);
+    let (mut log, found) = open(dir.path(), &spec, 256).unwrap();
+    let held: usize = found.iter().map(|segment| segment.steps).sum();
+    assert!((256..=256 + 32).contains(&held), "{held} transitions");
+    assert_eq!(found.last().unwrap().sequence, 400);
+    assert_eq!((log.durable(77), log.durable(1), log.state().segments), (5, 400, 401));
+    assert_eq!(log.append(again).unwrap(), []);
+}
+
+#[test]
+fn disk_space_stays_bounded_while_many_times_the_capacity_passes_through() {
+    let (dir, spec) = (TempDir::new().unwrap(), fixtures::get_up_spec());
+    let capacity = 16_384;
+    let (mut log, _) = open(dir.path(), &spec, capacity).unwrap();
+    let mut most = 0;
+    for round in 0..160 {
+        let group = (1..=16).map(|i| fixtures::segment(&spec, 1, round * 16 + i, 64)).collect();
+        log.append(group).unwrap();
+        most = most.max(disk_bytes(dir.path()));
+    }
+    let payload = (capacity * 90 * 4) as u64;
+    assert!(most < 12 * payload, "{} MB for {} MB", most >> 20, payload >> 20);
+}
+
+#[test]
+fn a_smaller_or_larger_capacity_takes_over_a_store() {
+    let (dir, spec) = (TempDir::new().unwrap(), fixtures::spec(8));
+    for (capacity, sequences) in [(512, 1..=100), (64, 101..=102), (64, 103..=130), (1024, 131..=200)] {
+        let (mut log, _) = open(dir.path(), &spec, capacity).unwrap();
+        for sequence in sequences {
+            log.append(vec![fixtures::segment(&spec, 1, sequence, 8)]).unwrap();
+        }
+    }
+    let (log, found) = open(dir.path(), &spec, 1024).unwrap();
+    assert_eq!(log.state().segments, 200);
+    let sequences: Vec<_> = found.iter().map(|segment| segment.sequence).collect();
+    assert_eq!(sequences, (sequences[0]..=200).collect::<Vec<_>>());
+}
+
+#[test]
+fn another_run_another_format_and_a_second_process_are_refused_with_the_way_out() {
+    let (dir, spec) = (TempDir::new().unwrap(), fixtures::spec(8));
+    let (log, _) = open(dir.path(), &spec, 256).unwrap();
+    let in_use = open(dir.path(), &spec, 256).unwrap_err().to_string();
+    assert!(in_use.contains("in use by another process: end that one"), "{in_use}");
+    drop(log);
+
+    let mut other = spec.clone();
+    other.run = "other".to_owned();
+    let refused = open(dir.path(), &other, 256).unwrap_err().to_string();
+    assert!(refused.contains("another run") && refused.contains("the run is `test`"), "{refused}");
+
+    let manifest = dir.path().join("store.json");
+    let text = fs::read_to_string(&manifest).unwrap().replace("\"format\": 1", "\"format\": 7");
+    fs::write(&manifest, text).unwrap();
+    let refused = open(dir.path(), &spec, 256).unwrap_err().to_string();
+    assert!(refused.contains("has format 7") && refused.contains("move the folder away"), "{refused}");
+}
+
+#[test]
+fn a_missing_or_damaged_small_file_is_named() {
+    let spec = fixtures::spec(8);
+    for (file, content) in [
+        ("store.json", Some("{\"format\": 1")),
+        ("store.json", Some("{}")),
+        ("store.json", None),
+        ("watermark", Some("short")),
+        ("watermark", None),
+    ] {
+        let dir = TempDir::new().unwrap();
+        written(dir.path(), &fixtures::spec(64), 3);
+        match content {
+            Some(content) => fs::write(dir.path().join(file), content).unwrap(),
+            None => fs::remove_file(dir.path().join(file)).unwrap(),
+        }
+        let refused = open(dir.path(), &spec, 256).unwrap_err().to_string();
+        assert!(refused.contains("damaged") && refused.contains(file), "{refused}");
+        assert!(refused.contains("Move the folder away"), "{refused}");
+    }
+}
+
+#[test]
+fn a_log_that_lost_what_it_acknowledged_is_refused() {
+    let (dir, spec) = (TempDir::new().unwrap(), fixtures::spec(64));
+    written(dir.path(), &spec, 20);
+    fs::remove_dir_all(dir.path().join(SLED)).unwrap();
+    let refused = open(dir.path(), &spec, 256).unwrap_err().to_string();
+    assert!(refused.contains("acknowledged 20 segments and holds the first 0"), "{refused}");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(if std::env::var_os("GETUP_TEST_FULL").is_some() { 600 } else { 24 }))]
+
+    #[test]
+    fn damage_anywhere_in_sleds_file_is_refused_or_harmless_and_never_a_panic(
+        place in 0.0f64..1.0,
+        length in 1usize..20_000,
+        kind in 0..3,
+    ) {
+        let (dir, spec) = (TempDir::new().unwrap(), fixtures::get_up_spec());
+        let segments = written(dir.path(), &spec, 40);
+        let path = dir.path().join(SLED).join("db");
+        let mut bytes = fs::read(&path).unwrap();
+        let from = (place * bytes.len() as f64) as usize;
+        let to = (from + length).min(bytes.len());
+        match kind {
+            0 => bytes[from..to].fill(0),
+            1 => bytes[from..to].iter_mut().for_each(|byte| *byte ^= 0x55),
+            _ => bytes.truncate(from),
+        }
+        fs::write(&path, bytes).unwrap();
+        match open(dir.path(), &spec, 10_000) {
+            Ok((_, found)) => prop_assert_eq!(found, segments),
+            Err(error) => {
+                let text = error.to_string();
+                prop_assert!(text.contains("damaged") && text.contains("Move the folder away"), "{}", text);
+            }
+        }
+    }
+}

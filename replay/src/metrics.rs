@@ -1,0 +1,98 @@
+//! What `/metrics` says of a replay: [`ReplayMetrics`], all names `getup_replay_…`.
+
+use getup_telemetry::prometheus::{
+    Gauge, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry, core::Collector,
+    exponential_buckets,
+};
+
+/// The metrics of one store and its service. Clones share them.
+#[derive(Clone, Debug)]
+pub struct ReplayMetrics {
+    pub(crate) transitions: IntGauge,
+    pub(crate) capacity: IntGauge,
+    pub(crate) memory_bytes: IntGauge,
+    pub(crate) disk_bytes: IntGauge,
+    pub(crate) inserted_env_steps: IntCounter,
+    pub(crate) inserted_transitions: IntCounter,
+    pub(crate) episodes: IntCounter,
+    pub(crate) sampled: IntCounter,
+    pub(crate) cursor: Gauge,
+    pub(crate) cursor_min: Gauge,
+    pub(crate) cursor_max: Gauge,
+    pub(crate) writers: IntGauge,
+    pub(crate) append_seconds: Histogram,
+    pub(crate) commit_segments: Histogram,
+    pub(crate) sample_seconds: Histogram,
+    rejected: IntCounterVec,
+}
+
+impl ReplayMetrics {
+    /// Registers the metrics.
+    ///
+    /// # Panics
+    /// When the registry has a replay's metrics already.
+    pub fn new(registry: &Registry) -> Self {
+        let gauge = |name: &str, help: &str| {
+            added(registry, IntGauge::new(format!("getup_replay_{name}"), help).expect(WELL_FORMED))
+        };
+        // Counters begin at the totals of earlier processes.
+        let counter = |name: &str, help: &str| {
+            added(registry, IntCounter::new(format!("getup_replay_{name}"), help).expect(WELL_FORMED))
+        };
+        let float = |name: &str, help: &str| {
+            added(registry, Gauge::new(format!("getup_replay_{name}"), help).expect(WELL_FORMED))
+        };
+        let histogram = |name: &str, help: &str, start, factor, count| {
+            let buckets = exponential_buckets(start, factor, count).expect(WELL_FORMED);
+            let options = HistogramOpts::new(format!("getup_replay_{name}"), help).buckets(buckets);
+            added(registry, Histogram::with_opts(options).expect(WELL_FORMED))
+        };
+        let rejected = Opts::new("getup_replay_rejected_total", "Appends and samples refused, by reason.");
+        let rejected = IntCounterVec::new(rejected, &["reason"]).expect(WELL_FORMED);
+        Self {
+            transitions: gauge("transitions", "Transitions that can be sampled now."),
+            capacity: gauge("capacity_transitions", "Transitions that fit."),
+            memory_bytes: gauge("memory_bytes", "Memory of a full ring."),
+            disk_bytes: gauge("disk_bytes", "Disk space of the log."),
+            inserted_env_steps: counter("env_steps_total", "Env steps ever stored."),
+            inserted_transitions: counter(
+                "inserted_transitions_total",
+                "Transitions ever stored, limp ones included.",
+            ),
+            episodes: counter("episodes_total", "Episodes whose end was stored."),
+            sampled: counter("sampled_transitions_total", "Transitions handed out in minibatches."),
+            cursor: float("limiter_cursor_samples", "Inserts x samples per insert - samples."),
+            cursor_min: float("limiter_cursor_min_samples", "Below, sampling waits."),
+            cursor_max: float("limiter_cursor_max_samples", "Above, inserting waits."),
+            writers: gauge("writers", "Writers connected."),
+            append_seconds: histogram(
+                "append_seconds",
+                "Time of a group commit until durable.",
+                1e-4,
+                2.0,
+                18,
+            ),
+            commit_segments: histogram("commit_segments", "Segments of a group commit.", 1.0, 2.0, 10),
+            sample_seconds: histogram(
+                "sample_seconds",
+                "Time to gather a minibatch, waits excluded.",
+                1e-5,
+                2.0,
+                16,
+            ),
+            rejected: added(registry, rejected),
+        }
+    }
+
+    /// Counts a refusal.
+    pub(crate) fn reject(&self, reason: &str) {
+        self.rejected.with_label_values(&[reason]).inc();
+    }
+}
+
+const WELL_FORMED: &str = "names, labels and buckets are well-formed";
+
+fn added<C: Collector + Clone + 'static>(registry: &Registry, collector: C) -> C {
+    registry.register(Box::new(collector.clone())).expect("a process has one replay");
+    collector
+}

@@ -1,0 +1,145 @@
+//! What sampling gives: [`Minibatch`], and how it is asked for: [`SampleOptions`].
+
+use bytes::Bytes;
+use getup_proto::{columns, v1};
+
+/// What a stream of minibatches is made of.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct SampleOptions {
+    /// Transitions a minibatch, from 1.
+    pub batch: usize,
+    /// Rewards are summed over this many steps of one episode, from 1; fewer at its end.
+    pub n_step: usize,
+    /// The discount γ a step, in [0, 1].
+    pub gamma: f32,
+    /// Seeds the sampler.
+    pub seed: u64,
+}
+
+/// Totals over a store's life; they survive restarts.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct ReplayCounters {
+    /// Names the store: a new one, or one that was cleared, has another.
+    pub store: u64,
+    /// Env steps ever stored; limp steps do not count.
+    pub env_steps: u64,
+    /// Transitions ever stored, limp ones included.
+    pub transitions: u64,
+    /// Episodes whose end was stored.
+    pub episodes: u64,
+    /// Transitions handed out in minibatches.
+    pub sampled: u64,
+}
+
+/// `batch` transitions, as contiguous columns.
+///
+/// The columns of the run's spec come in its order: of a column with a row a step or T + 1 rows the row where the
+/// transition begins, of one with a row an episode that row. `reward` is the n-step sum Σ γᵏ·rₖ. Then, for every
+/// column of T + 1 rows, `next_<name>`: its row where the transition ends. Last comes `discount`: γ to the number
+/// of steps the transition spans, or 0 if it ends in a terminal state. A truncated episode's value goes on.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct Minibatch {
+    /// Each of `batch` × its width values.
+    pub columns: Vec<MinibatchColumn>,
+    /// The store's totals, this minibatch included.
+    pub counters: ReplayCounters,
+}
+
+/// One column, row after row.
+#[derive(Clone, PartialEq, Debug)]
+pub struct MinibatchColumn {
+    /// See [`Minibatch`].
+    pub name: String,
+    /// Values a row.
+    pub width: usize,
+    /// `batch` × `width` values.
+    pub data: Vec<f32>,
+}
+
+/// Why what was asked for, or what came, is refused.
+#[derive(Clone, PartialEq, Debug, thiserror::Error)]
+pub enum OptionsError {
+    /// An empty or enormous batch.
+    #[error("a batch of {batch} cannot be sampled: it must lie in 1..={max}, so that a message holds it")]
+    Batch {
+        /// As asked for.
+        batch: usize,
+        /// What a message holds.
+        max: usize,
+    },
+    /// A batch that the limiter's band has no room for.
+    #[error(
+        "a batch of {batch} would never be let through: replay.error_buffer is {error_buffer}; raise it to the batch"
+    )]
+    Buffer {
+        /// As asked for.
+        batch: usize,
+        /// Half the width of the band.
+        error_buffer: f64,
+    },
+    /// No steps, or more than [`MAX_N_STEP`].
+    #[error("n_step is {0}: it must lie in 1..={MAX_N_STEP}")]
+    NStep(usize),
+    /// Not a discount.
+    #[error("gamma is {0}: it must lie in [0, 1]")]
+    Gamma(f32),
+}
+
+/// The most steps a transition may span.
+pub const MAX_N_STEP: usize = 1024;
+
+impl Minibatch {
+    /// The column of this name.
+    pub fn column(&self, name: &str) -> Option<&MinibatchColumn> {
+        self.columns.iter().find(|column| column.name == name)
+    }
+
+    pub(crate) fn to_wire(&self) -> v1::Minibatch {
+        let column = |column: &MinibatchColumn| v1::MinibatchColumn {
+            name: column.name.clone(),
+            width: column.width as u32,
+            data: columns::encode(&column.data),
+        };
+        v1::Minibatch {
+            columns: self.columns.iter().map(column).collect(),
+            counters: Some(self.counters.into()),
+        }
+    }
+
+    /// Parses a message; None unless every column has `batch` rows and the counters are there.
+    pub(crate) fn parse(wire: v1::Minibatch, batch: usize) -> Option<Self> {
+        let columns = wire.columns.into_iter().map(|column| MinibatchColumn::parse(column, batch));
+        Some(Self { columns: columns.collect::<Option<_>>()?, counters: wire.counters?.into() })
+    }
+}
+
+impl MinibatchColumn {
+    fn parse(wire: v1::MinibatchColumn, batch: usize) -> Option<Self> {
+        let v1::MinibatchColumn { name, width, data } = wire;
+        let width = width as usize;
+        let values = width.checked_mul(batch)?;
+        (data.len() == values.checked_mul(columns::VALUE_BYTES)?).then(|| Self {
+            name,
+            width,
+            data: decode(&data),
+        })
+    }
+}
+
+fn decode(data: &Bytes) -> Vec<f32> {
+    columns::iter(data).collect()
+}
+
+impl From<v1::ReplayCounters> for ReplayCounters {
+    fn from(wire: v1::ReplayCounters) -> Self {
+        let v1::ReplayCounters { store, env_steps, transitions, episodes, sampled } = wire;
+        Self { store, env_steps, transitions, episodes, sampled }
+    }
+}
+
+impl From<ReplayCounters> for v1::ReplayCounters {
+    fn from(counters: ReplayCounters) -> Self {
+        let ReplayCounters { store, env_steps, transitions, episodes, sampled } = counters;
+        Self { store, env_steps, transitions, episodes, sampled }
+    }
+}

@@ -1,0 +1,253 @@
+//! The transitions that can be sampled, in memory: [`Ring`].
+//!
+//! A segment of T steps takes T + 1 rows. A row holds, side by side, everything that belongs to one step: the
+//! observation before it, its action, its reward, and the episode's β̂; the last row holds the final observation
+//! alone. So a transition is two neighbouring rows, no next state is stored twice, and sampling one touches one
+//! place in memory. Rows are numbered from the first ever pushed and lie in a buffer that wraps around.
+//!
+//! The oldest segments leave, whole, when a new one would exceed the capacity. What is in the ring is therefore a
+//! function of the segments pushed most recently, however many were pushed before: a ring that is rebuilt from
+//! the log equals the one that was lost.
+
+use getup_proto::{Rows, RunSpec, Segment, columns};
+use std::collections::{HashMap, VecDeque};
+use std::ops::Range;
+
+/// A row, by its number since the ring began.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) struct Row(u64);
+
+impl Row {
+    /// Counts from the first row ever pushed.
+    #[cfg(test)]
+    pub(crate) fn number(self) -> u64 {
+        self.0
+    }
+}
+
+/// The newest transitions, up to a capacity.
+#[derive(Debug)]
+pub(crate) struct Ring {
+    layout: Layout,
+    /// Transitions that may be in the ring.
+    capacity: usize,
+    /// Transitions that are.
+    transitions: usize,
+    /// Row after row.
+    values: Vec<f32>,
+    /// The segment that each row belongs to, by the low bits of its number.
+    owners: Vec<u32>,
+    segments: VecDeque<Entry>,
+    /// Number of the oldest segment.
+    first_segment: u64,
+    /// Numbers of the rows in the ring.
+    live: Range<u64>,
+    /// The newest segment of each episode that may go on.
+    unfinished: HashMap<Lane, u64>,
+}
+
+/// Where each column of the spec lies in a row.
+#[derive(Debug)]
+pub(crate) struct Layout {
+    /// In the spec's order.
+    pub(crate) columns: Vec<LayoutColumn>,
+    /// Values a row.
+    stride: usize,
+}
+
+#[derive(Debug)]
+pub(crate) struct LayoutColumn {
+    pub(crate) name: String,
+    pub(crate) rows: Rows,
+    /// Place in the row.
+    pub(crate) at: Range<usize>,
+}
+
+/// A lane, among those of all writers.
+type Lane = (u64, u32);
+
+/// A segment in the ring.
+#[derive(Clone, Debug)]
+pub(crate) struct Entry {
+    pub(crate) first_row: Row,
+    pub(crate) steps: u64,
+    pub(crate) terminal: bool,
+    /// Number of the segment that continues the episode.
+    continued_by: Option<u64>,
+    lane: Lane,
+    episode: u64,
+    /// Index in the episode of the step after the last.
+    next_step: u64,
+}
+
+impl Ring {
+    /// An empty ring for `capacity` transitions. Memory is taken as it fills.
+    pub(crate) fn new(spec: &RunSpec, capacity: usize) -> Self {
+        let layout = Layout::new(spec);
+        // One row more a segment: enough where segments have 8 steps on average. Below that rows run out before
+        // transitions do, and the ring holds somewhat fewer.
+        let rows = capacity + capacity / 8 + spec.max_segment_steps + 1;
+        Self {
+            values: vec![0.0; rows * layout.stride],
+            owners: vec![0; rows],
+            layout,
+            capacity,
+            transitions: 0,
+            segments: VecDeque::new(),
+            first_segment: 0,
+            live: 0..0,
+            unfinished: HashMap::new(),
+        }
+    }
+
+    /// Adds a segment that follows the ring's spec, and drops the oldest ones to make room.
+    pub(crate) fn push(&mut self, segment: &Segment) {
+        let rows = segment.steps as u64 + 1;
+        while self.transitions + segment.steps > self.capacity
+            || self.live.end - self.live.start + rows > self.owners.len() as u64
+        {
+            self.evict();
+        }
+        let number = self.first_segment + self.segments.len() as u64;
+        let first_row = Row(self.live.end);
+        self.live.end += rows;
+        self.write_rows(first_row, number, segment);
+        self.link(number, segment);
+        self.transitions += segment.steps;
+        self.segments.push_back(Entry {
+            first_row,
+            steps: segment.steps as u64,
+            terminal: segment.terminal,
+            continued_by: None,
+            lane: (segment.writer, segment.lane),
+            episode: segment.episode,
+            next_step: u64::from(segment.first_step) + segment.steps as u64,
+        });
+    }
+
+    /// Transitions in the ring.
+    pub(crate) fn len(&self) -> usize {
+        self.transitions
+    }
+
+    /// Rows in the ring.
+    pub(crate) fn rows(&self) -> u64 {
+        self.live.end - self.live.start
+    }
+
+    /// Bytes that a full ring takes.
+    pub(crate) fn memory_bytes(&self) -> usize {
+        size_of_val(self.values.as_slice()) + size_of_val(self.owners.as_slice())
+    }
+
+    pub(crate) fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// The `n`th of the rows in the ring, from the oldest.
+    pub(crate) fn nth_row(&self, n: u64) -> Row {
+        Row(self.live.start + n)
+    }
+
+    /// Whether a transition begins at the row: all but the last of a segment.
+    pub(crate) fn begins_transition(&self, row: Row) -> bool {
+        self.entry_of(row).steps_after(row) > 0
+    }
+
+    /// The segment that a row belongs to.
+    pub(crate) fn entry_of(&self, row: Row) -> &Entry {
+        let oldest = self.first_segment as u32;
+        &self.segments[self.owners[self.slot(row)].wrapping_sub(oldest) as usize]
+    }
+
+    /// The segment that continues the episode, where it is there.
+    pub(crate) fn continuation(&self, entry: &Entry) -> Option<&Entry> {
+        entry.continued_by.map(|number| &self.segments[(number - self.first_segment) as usize])
+    }
+
+    /// Where in the buffer a row lies.
+    pub(crate) fn slot(&self, row: Row) -> usize {
+        (row.0 % self.owners.len() as u64) as usize
+    }
+
+    /// The slot of the row after the one in `slot`.
+    pub(crate) fn slot_after(&self, slot: usize) -> usize {
+        if slot + 1 == self.owners.len() { 0 } else { slot + 1 }
+    }
+
+    /// The values of the row in `slot`.
+    pub(crate) fn values(&self, slot: usize) -> &[f32] {
+        &self.values[slot * self.layout.stride..][..self.layout.stride]
+    }
+
+    fn evict(&mut self) {
+        let entry = self.segments.pop_front().expect("a ring has room for its longest segment");
+        self.transitions -= entry.steps as usize;
+        self.live.start += entry.steps + 1;
+        if self.unfinished.get(&entry.lane) == Some(&self.first_segment) {
+            self.unfinished.remove(&entry.lane);
+        }
+        self.first_segment += 1;
+    }
+
+    fn write_rows(&mut self, first_row: Row, number: u64, segment: &Segment) {
+        let stride = self.layout.stride;
+        let mut slot = self.slot(first_row);
+        for step in 0..=segment.steps {
+            self.owners[slot] = number as u32;
+            let row = &mut self.values[slot * stride..][..stride];
+            for (column, bytes) in self.layout.columns.iter().zip(&segment.columns) {
+                let from = match column.rows {
+                    Rows::Once => 0,
+                    // The last row has no step.
+                    Rows::Steps if step == segment.steps => continue,
+                    Rows::Steps | Rows::StepsPlusOne => step,
+                };
+                let row_bytes = column.at.len() * columns::VALUE_BYTES;
+                columns::decode_into(&bytes[from * row_bytes..][..row_bytes], &mut row[column.at.clone()]);
+            }
+            slot = self.slot_after(slot);
+        }
+    }
+
+    /// Notes that `segment`, which is about to be pushed as `number`, goes on where an earlier one ended.
+    fn link(&mut self, number: u64, segment: &Segment) {
+        let lane = (segment.writer, segment.lane);
+        if let Some(previous) = self.unfinished.remove(&lane) {
+            let previous = &mut self.segments[(previous - self.first_segment) as usize];
+            if previous.episode == segment.episode && previous.next_step == u64::from(segment.first_step) {
+                previous.continued_by = Some(number);
+            }
+        }
+        if !segment.terminal && !segment.truncated {
+            self.unfinished.insert(lane, number);
+        }
+    }
+}
+
+impl Entry {
+    /// Steps of the segment from `row` on, which is one of its rows.
+    pub(crate) fn steps_after(&self, row: Row) -> u64 {
+        self.first_row.0 + self.steps - row.0
+    }
+}
+
+impl Layout {
+    fn new(spec: &RunSpec) -> Self {
+        let mut stride = 0;
+        let columns = spec
+            .columns
+            .iter()
+            .map(|column| {
+                let at = stride..stride + column.width;
+                stride = at.end;
+                LayoutColumn { name: column.name.clone(), rows: column.rows, at }
+            })
+            .collect();
+        Self { columns, stride }
+    }
+}
+
+#[cfg(test)]
+#[path = "ring_tests.rs"]
+mod tests;

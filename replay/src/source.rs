@@ -1,0 +1,121 @@
+//! Where a learner gets its minibatches from: [`MinibatchSource`].
+//!
+//! [`LocalSource`] reads a store of the same process. [`crate::RemoteSource`] asks a replay service. A learner
+//! cannot tell which it has.
+
+use crate::error::StoreError;
+use crate::minibatch::{Minibatch, OptionsError, SampleOptions};
+use crate::sampler::Sampler;
+use crate::store::Store;
+use getup_telemetry::Shutdown;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+/// Gives minibatches, one after another.
+pub trait MinibatchSource: Send {
+    /// The next minibatch, or None if there is none within `patience`.
+    ///
+    /// # Errors
+    /// [`SampleError`]; [`SampleError::Shutdown`] when the wait is cancelled.
+    fn poll(&mut self, patience: Duration) -> Result<Option<Minibatch>, SampleError>;
+
+    /// The next minibatch. Waits for it, with a reason that logs, metrics and `status` show.
+    ///
+    /// # Errors
+    /// As [`MinibatchSource::poll`].
+    fn next(&mut self) -> Result<Minibatch, SampleError> {
+        loop {
+            if let Some(minibatch) = self.poll(Duration::from_secs(60))? {
+                return Ok(minibatch);
+            }
+        }
+    }
+}
+
+/// Why there is no next minibatch.
+#[derive(Debug, thiserror::Error)]
+pub enum SampleError {
+    /// The process is shutting down.
+    #[error("sampling ended: the process is shutting down")]
+    Shutdown,
+    /// The options cannot be served.
+    #[error(transparent)]
+    Options(#[from] OptionsError),
+    /// The store failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The service refuses, and would again.
+    #[error("replay at {endpoint} refuses to be sampled: {reason}")]
+    Refused {
+        /// Where it listens.
+        endpoint: String,
+        /// Its words.
+        reason: String,
+    },
+}
+
+/// Samples a store of the same process.
+#[derive(Debug)]
+pub struct LocalSource {
+    store: Arc<Store>,
+    sampler: Sampler,
+    options: SampleOptions,
+    shutdown: Shutdown,
+    /// Among the samplers at the gate.
+    id: u64,
+}
+
+impl LocalSource {
+    /// A source of minibatches from `store`, for a sampler that others see as `name`.
+    ///
+    /// # Errors
+    /// [`SampleError::Options`] if the store cannot serve them.
+    pub fn new(
+        store: Arc<Store>,
+        options: SampleOptions,
+        name: &str,
+        shutdown: Shutdown,
+    ) -> Result<Self, SampleError> {
+        static NEXT: AtomicU64 = AtomicU64::new(0);
+        store.check_options(&options)?;
+        let id = NEXT.fetch_add(1, Ordering::Relaxed);
+        store.gate().sampler_came(id, name);
+        Ok(Self { store, sampler: Sampler::uniform(options.seed), options, shutdown, id })
+    }
+
+    /// The sampler's state, to be saved in a checkpoint.
+    pub fn sampler(&self) -> &Sampler {
+        &self.sampler
+    }
+
+    /// Goes on with a sampler that was saved.
+    pub fn restore(&mut self, sampler: Sampler) {
+        self.sampler = sampler;
+    }
+}
+
+impl MinibatchSource for LocalSource {
+    fn poll(&mut self, patience: Duration) -> Result<Option<Minibatch>, SampleError> {
+        let gate = self.store.gate();
+        gate.heard_sampler(self.id);
+        loop {
+            if self.shutdown.is_triggered() {
+                return Err(SampleError::Shutdown);
+            }
+            if let Some(minibatch) = self.store.try_sample(&mut self.sampler, &self.options)? {
+                return Ok(Some(minibatch));
+            }
+            // Another sampler may be quicker than this one after the wait.
+            if !gate.wait_to_sample(self.options.batch as u64, patience, &self.shutdown) {
+                return if self.shutdown.is_triggered() { Err(SampleError::Shutdown) } else { Ok(None) };
+            }
+        }
+    }
+}
+
+impl Drop for LocalSource {
+    fn drop(&mut self) {
+        self.store.gate().sampler_went(self.id);
+    }
+}

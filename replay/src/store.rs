@@ -1,0 +1,345 @@
+//! The store itself: [`Store`], a durable log, the ring that is sampled from, and the gate between them.
+//!
+//! A segment is appended in four steps: it is checked; it becomes durable in the log; it enters the ring; the
+//! limiter counts it. Only then does [`Store::append`] return, which is the acknowledgement. Sampling takes the
+//! limiter's leave, then reads the ring. Neither holds up the other but for the moment of a copy.
+
+use crate::config::ReplayConfig;
+use crate::error::StoreError;
+use crate::gate::{Gate, Permit};
+use crate::gather::gather;
+use crate::limiter::Limiter;
+use crate::log::{self, Log, State, Watermark};
+use crate::metrics::ReplayMetrics;
+use crate::minibatch::{MAX_N_STEP, Minibatch, OptionsError, ReplayCounters, SampleOptions};
+use crate::ring::Ring;
+use crate::sampler::Sampler;
+use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment, columns, v1};
+use getup_telemetry::{Shutdown, Waits};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
+use std::time::{Duration, Instant};
+
+/// How often the disk space is measured, at most.
+const MEASURE_EVERY: Duration = Duration::from_secs(5);
+
+/// A replay store. Threads share it in an [`Arc`].
+#[derive(Debug)]
+pub struct Store {
+    dir: PathBuf,
+    spec: RunSpec,
+    /// Names the store.
+    id: u64,
+    capacity: usize,
+    /// Locked by one append at a time, for as long as the disk takes.
+    log: Mutex<Writing>,
+    /// Locked briefly.
+    memory: RwLock<Memory>,
+    gate: Arc<Gate>,
+    watermark: Arc<Watermark>,
+    metrics: ReplayMetrics,
+    waits: Waits,
+}
+
+/// What appends need.
+#[derive(Debug)]
+struct Writing {
+    log: Log,
+    disk_measured: Instant,
+}
+
+/// What sampling needs.
+#[derive(Debug)]
+struct Memory {
+    ring: Ring,
+    state: State,
+}
+
+impl Store {
+    /// Opens the store in the folder `dir`, or creates it, and reads back what it holds.
+    ///
+    /// # Errors
+    /// [`StoreError`], if the store is damaged, in use, of another run or of another format, or cannot be read.
+    pub fn open(
+        dir: &Path,
+        spec: &RunSpec,
+        config: &ReplayConfig,
+        metrics: ReplayMetrics,
+        waits: Waits,
+    ) -> Result<Self, StoreError> {
+        spec.validate()?;
+        config.validate_for(spec)?;
+        let started = Instant::now();
+        let mut ring = Ring::new(spec, config.capacity);
+        let log = Log::open(dir, spec, config, |segment| ring.push(segment))?;
+        let (state, sampled) = (log.state(), log.watermark().sampled()?);
+        let mut limiter = Limiter::new(config, spec);
+        limiter.restore(state.env_steps, sampled);
+        if state.segments > 0 {
+            tracing::info!(
+                transitions = ring.len(),
+                env_steps = state.env_steps,
+                seconds = started.elapsed().as_secs_f64(),
+                "replay goes on from {}",
+                dir.display()
+            );
+        }
+        metrics.inserted_env_steps.inc_by(state.env_steps);
+        metrics.inserted_transitions.inc_by(state.transitions);
+        metrics.episodes.inc_by(state.episodes);
+        metrics.sampled.inc_by(sampled);
+        metrics.capacity.set(config.capacity as i64);
+        metrics.memory_bytes.set(ring.memory_bytes() as i64);
+        metrics.disk_bytes.set(log::disk_bytes(dir) as i64);
+        if let Some((_, min, max)) = limiter.band() {
+            metrics.cursor_min.set(min);
+            metrics.cursor_max.set(max);
+        }
+        let store = Self {
+            dir: dir.to_owned(),
+            spec: spec.clone(),
+            id: log.store(),
+            capacity: config.capacity,
+            watermark: log.watermark().clone(),
+            log: Mutex::new(Writing { log, disk_measured: started }),
+            memory: RwLock::new(Memory { ring, state }),
+            gate: Gate::new(limiter, waits.clone()),
+            metrics,
+            waits,
+        };
+        store.show_limiter();
+        Ok(store)
+    }
+
+    /// The run's spec.
+    pub fn spec(&self) -> &RunSpec {
+        &self.spec
+    }
+
+    /// Notes that a writer has come, under the name that logs and `status` show, and returns the greatest sequence
+    /// number of it that is durable: it goes on from there. [`Store::farewell`] when it goes.
+    pub fn introduce(&self, writer: u64, name: &str) -> u64 {
+        self.gate.writer_came(writer, name);
+        self.metrics.writers.inc();
+        self.writing().log.durable(writer)
+    }
+
+    /// Notes that a writer that was introduced has gone.
+    pub fn farewell(&self, writer: u64) {
+        self.gate.writer_went(writer);
+        self.metrics.writers.dec();
+    }
+
+    /// Whether the limiter lets so many env steps in now.
+    pub fn can_insert(&self, env_steps: u64) -> bool {
+        self.gate.limiter().blocks_insert(env_steps).is_none()
+    }
+
+    /// Whether the limiter lets a minibatch of so many transitions out now.
+    pub fn can_sample(&self, batch: usize) -> bool {
+        self.gate.limiter().blocks_sample(batch as u64).is_none()
+    }
+
+    /// Waits until the limiter lets the segments in, then appends them. Each must have room in the limiter's band
+    /// by itself; they are appended one after another where they do not have it together.
+    ///
+    /// # Errors
+    /// As [`Store::append`]. False if `shutdown` ended the wait: the rest was not appended.
+    pub fn append_when_due(&self, segments: Vec<Segment>, shutdown: &Shutdown) -> Result<bool, StoreError> {
+        let all: u64 = segments.iter().map(|segment| u64::from(segment.env_steps)).sum();
+        if let Some(_permit) = self.gate.try_admit(all) {
+            self.append(segments)?;
+            return Ok(true);
+        }
+        for segment in segments {
+            let Some(_permit) = self.gate.admit(u64::from(segment.env_steps), shutdown) else {
+                return Ok(false);
+            };
+            self.append(vec![segment])?;
+        }
+        Ok(true)
+    }
+
+    /// Appends segments without asking the limiter, in one group commit: when this returns they are durable and
+    /// can be sampled. Those that were stored before are left out. If one is malformed, none is appended.
+    ///
+    /// # Errors
+    /// [`StoreError::Segment`] if a segment does not follow the spec. Any other error ends all appending:
+    /// what is durable is known when the store is opened again.
+    pub fn append(&self, segments: Vec<Segment>) -> Result<(), StoreError> {
+        for segment in &segments {
+            if let Err(error) = segment.check(&self.spec) {
+                self.metrics.reject(error.kind());
+                return Err(error.into());
+            }
+        }
+        self.append_checked(segments)
+    }
+
+    /// As [`Store::append`], for segments that were parsed.
+    pub(crate) fn append_checked(&self, segments: Vec<Segment>) -> Result<(), StoreError> {
+        let started = Instant::now();
+        let Some(newest) = segments.last() else { return Ok(()) };
+        self.gate.heard_writer(newest.writer);
+        let wait = self.waits.begin("replay", format!("the disk takes {} segments", segments.len()));
+        let mut writing = self.writing();
+        let fresh = writing.log.append(segments)?;
+        drop(wait);
+        let state = writing.log.state();
+        {
+            let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
+            for segment in &fresh {
+                memory.ring.push(segment);
+            }
+            memory.state = state;
+            self.metrics.transitions.set(memory.ring.len() as i64);
+        }
+        let count = |of: fn(&Segment) -> u64| fresh.iter().map(of).sum::<u64>();
+        let env_steps = count(|segment| u64::from(segment.env_steps));
+        self.gate.insert(env_steps);
+
+        self.metrics.inserted_env_steps.inc_by(env_steps);
+        self.metrics.inserted_transitions.inc_by(count(|segment| segment.steps as u64));
+        self.metrics.episodes.inc_by(count(|segment| u64::from(segment.end.is_some())));
+        self.metrics.commit_segments.observe(fresh.len() as f64);
+        self.metrics.append_seconds.observe(started.elapsed().as_secs_f64());
+        self.show_limiter();
+        if writing.disk_measured.elapsed() >= MEASURE_EVERY {
+            writing.disk_measured = Instant::now();
+            self.metrics.disk_bytes.set(log::disk_bytes(&self.dir) as i64);
+        }
+        Ok(())
+    }
+
+    /// Whether minibatches of this kind can be sampled from this store.
+    ///
+    /// # Errors
+    /// [`OptionsError`] with the first option that is out of range.
+    pub fn check_options(&self, options: &SampleOptions) -> Result<(), OptionsError> {
+        let &SampleOptions { batch, n_step, gamma, .. } = options;
+        // At most two rows of every column, and a few numbers.
+        let widths: usize = self.spec.columns.iter().map(|column| column.width).sum();
+        let max = MAX_MESSAGE_BYTES / 2 / ((2 * widths + 2) * columns::VALUE_BYTES);
+        if !(1..=max).contains(&batch) {
+            return Err(OptionsError::Batch { batch, max });
+        }
+        let error_buffer = self.gate.limiter().largest_sample();
+        if batch as f64 > error_buffer {
+            return Err(OptionsError::Buffer { batch, error_buffer });
+        }
+        if !(1..=MAX_N_STEP).contains(&n_step) {
+            return Err(OptionsError::NStep(n_step));
+        }
+        if !(0.0..=1.0).contains(&gamma) {
+            return Err(OptionsError::Gamma(gamma));
+        }
+        Ok(())
+    }
+
+    /// A minibatch, if the limiter lets one out now.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`] if the sample cannot be counted.
+    pub fn try_sample(
+        &self,
+        sampler: &mut Sampler,
+        options: &SampleOptions,
+    ) -> Result<Option<Minibatch>, StoreError> {
+        let started = Instant::now();
+        let mut sampled = 0;
+        let count = |total| {
+            sampled = total;
+            self.watermark.set_sampled(total)
+        };
+        if !self.gate.try_sample(options.batch as u64, count)? {
+            return Ok(None);
+        }
+        let memory = self.memory();
+        let columns = gather(&memory.ring, sampler, options);
+        let counters = self.counters_of(memory.state, sampled);
+        drop(memory);
+        self.metrics.sampled.inc_by(options.batch as u64);
+        self.metrics.sample_seconds.observe(started.elapsed().as_secs_f64());
+        self.show_limiter();
+        Ok(Some(Minibatch { columns, counters }))
+    }
+
+    /// Totals over the store's life.
+    pub fn counters(&self) -> ReplayCounters {
+        self.counters_of(self.memory().state, self.gate.limiter().samples())
+    }
+
+    /// Transitions that can be sampled now.
+    pub fn len(&self) -> usize {
+        self.memory().ring.len()
+    }
+
+    /// Whether there is nothing to sample.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The spec, sizes, counters, and the limiter's state. Waits for an append that is under way.
+    pub fn describe(&self) -> v1::DescribeReply {
+        let limiter = self.gate.limiter();
+        let (samples_per_insert, min_cursor, max_cursor) = limiter.band().unwrap_or_default();
+        let writers = self.gate.writers();
+        let writing = self.writing();
+        let writer = |(writer, peer): (u64, crate::gate::Peer)| v1::WriterState {
+            name: peer.name,
+            writer,
+            durable_sequence: writing.log.durable(writer),
+            silent_seconds: peer.heard.elapsed().as_secs_f64(),
+        };
+        let writers = writers.into_iter().map(writer).collect();
+        drop(writing);
+        v1::DescribeReply {
+            spec: Some(self.spec.to_wire()),
+            counters: Some(self.counters().into()),
+            size: self.len() as u64,
+            capacity: self.capacity as u64,
+            memory_bytes: self.memory().ring.memory_bytes() as u64,
+            disk_bytes: log::disk_bytes(&self.dir),
+            limiter: Some(v1::LimiterState {
+                min_size: limiter.min_size(),
+                samples_per_insert,
+                cursor: limiter.cursor(),
+                min_cursor,
+                max_cursor,
+                waiting: self.gate.waiting(),
+            }),
+            writers,
+        }
+    }
+
+    pub(crate) fn gate(&self) -> &Arc<Gate> {
+        &self.gate
+    }
+
+    pub(crate) fn metrics(&self) -> &ReplayMetrics {
+        &self.metrics
+    }
+
+    /// Room for a segment, for the service: waits as a task.
+    pub(crate) async fn admit(&self, env_steps: u64) -> Permit {
+        self.gate.admit_task(env_steps).await
+    }
+
+    fn counters_of(&self, state: State, sampled: u64) -> ReplayCounters {
+        let State { env_steps, transitions, episodes, .. } = state;
+        ReplayCounters { store: self.id, env_steps, transitions, episodes, sampled }
+    }
+
+    fn show_limiter(&self) {
+        self.metrics.cursor.set(self.gate.limiter().cursor());
+    }
+
+    fn writing(&self) -> MutexGuard<'_, Writing> {
+        // A log that panicked refuses all further appends by itself.
+        self.log.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn memory(&self) -> RwLockReadGuard<'_, Memory> {
+        self.memory.read().unwrap_or_else(PoisonError::into_inner)
+    }
+}

@@ -1,0 +1,73 @@
+//! `getup actor`: the actor as a process.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use getup_actor::grpc::{GrpcLearner, GrpcReplay};
+use getup_actor::identity::Identity;
+use getup_actor::worker::{self, ActorSetup};
+use getup_telemetry::health;
+use tokio_stream::wrappers::TcpListenerStream;
+
+use crate::config::Config;
+use crate::role::{Role, RoleArgs, bind, host_name};
+
+/// Run an actor: simulates episodes under the newest policy, pushes them to the replay, plays leased evaluations.
+///
+/// It waits for replay and learner to be there, reconnects when they come back, and may be killed at any moment.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    role: RoleArgs,
+    /// Names this actor in logs, metrics and `getup status`. [default: host name and process id]
+    #[arg(long)]
+    name: Option<String>,
+    /// Where the states of simulations that diverged are kept, for `getup rollout`.
+    #[arg(long, value_name = "DIR", default_value = "diverged")]
+    diverged: PathBuf,
+}
+
+pub(crate) fn run(arguments: Args) -> Result<()> {
+    let mut config = arguments.role.config.load()?;
+    config.actor.name = arguments.name.unwrap_or_else(|| format!("{}-{}", host_name(), std::process::id()));
+    let role = Role::new("actor", arguments.role.log_format)?;
+    role.run(serve(&config, &role, arguments.diverged))
+}
+
+async fn serve(config: &Config, role: &Role, diverged: PathBuf) -> Result<()> {
+    let identity = Identity::new(&config.actor.name, config.seed);
+    let setup = setup(config, identity.clone(), diverged)?;
+    let network = &config.network;
+    let waits = &role.waits;
+    let writer = GrpcReplay::new(&url(&network.replay), setup.spec.clone(), identity, waits.clone())?;
+    let link = GrpcLearner::new(&url(&network.learner), setup.spec.clone(), &config.actor.name, waits.clone())?;
+    role.serve_metrics(&network.actor_metrics).await?;
+    let listener = bind(&network.actor, "gRPC health").await?;
+    tracing::info!(name = config.actor.name, health = %listener.local_addr()?, "actor started");
+    let (_reporter, health) = health();
+    let ended = role.shutdown.clone();
+    let server = tonic::transport::Server::builder()
+        .add_service(health)
+        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move { ended.wait().await });
+    let server = tokio::spawn(server);
+    let result = worker::run(setup, writer, link, waits.clone(), role.shutdown.clone(), &role.registry).await;
+    role.shutdown.trigger();
+    server.await??;
+    Ok(result?)
+}
+
+fn url(address: &str) -> String {
+    format!("http://{address}")
+}
+
+/// Everything that an actor of this run is made from.
+pub(crate) fn setup(config: &Config, identity: Identity, diverged_folder: PathBuf) -> Result<ActorSetup> {
+    Ok(ActorSetup {
+        config: config.actor.clone(),
+        task: config.task.clone(),
+        spec: config.run_spec()?,
+        identity,
+        beta: config.beta_draw(),
+        diverged_folder,
+    })
+}

@@ -1,0 +1,280 @@
+//! The configuration of a run: one file for all roles, made of one table a room.
+
+mod layers;
+
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use clap::Args;
+use getup_actor::config::ActorConfig;
+use getup_actor::explore::BetaDraw;
+use getup_learner::config::{CurriculumConfig, EvaluationConfig, LearnerConfig, SacConfig};
+use getup_replay::{ReplayConfig, Sync};
+use getup_proto::{ColumnSpec, Rows, RunSpec, columns};
+use getup_sim::{GetUp, Task, TaskConfig};
+use serde::{Deserialize, Serialize};
+
+pub(crate) use layers::Layers;
+
+/// Everything a run depends on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub(crate) struct Config {
+    /// The preset it began as.
+    pub(crate) preset: String,
+    /// The run's name; roles of different runs refuse each other.
+    pub(crate) run: String,
+    /// Every random draw comes from it.
+    pub(crate) seed: u64,
+    /// Env steps of the whole run; 0 lets the curriculum end it.
+    pub(crate) steps: u64,
+    pub(crate) task: TaskConfig,
+    pub(crate) actor: ActorConfig,
+    pub(crate) replay: ReplayTable,
+    pub(crate) sac: SacConfig,
+    pub(crate) curriculum: CurriculumConfig,
+    pub(crate) evaluation: EvaluationConfig,
+    pub(crate) learner: LearnerConfig,
+    pub(crate) network: NetworkConfig,
+}
+
+/// The replay's own settings; when it may be sampled follows from `[sac]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub(crate) struct ReplayTable {
+    /// Transitions that can be sampled; the oldest go first.
+    pub(crate) capacity: usize,
+    /// What an acknowledged segment survives: `process` (a kill) or `data` (a power loss too).
+    pub(crate) sync: Sync,
+}
+
+impl Default for ReplayTable {
+    fn default() -> Self {
+        let ReplayConfig { capacity, sync, .. } = ReplayConfig::default();
+        Self { capacity, sync }
+    }
+}
+
+/// Where the roles listen, and where they find each other.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub(crate) struct NetworkConfig {
+    /// The replay's gRPC address: it listens there, the others connect there.
+    pub(crate) replay: String,
+    /// The learner's gRPC address, likewise.
+    pub(crate) learner: String,
+    /// Where an actor serves gRPC health; port 0 takes any.
+    pub(crate) actor: String,
+    /// Where each role serves `/metrics`; port 0 takes any.
+    pub(crate) replay_metrics: String,
+    /// See `replay_metrics`.
+    pub(crate) learner_metrics: String,
+    /// See `replay_metrics`.
+    pub(crate) actor_metrics: String,
+}
+
+impl Default for NetworkConfig {
+    fn default() -> Self {
+        let local = |port: u16| format!("127.0.0.1:{port}");
+        Self {
+            replay: local(7401),
+            learner: local(7402),
+            actor: local(0),
+            replay_metrics: local(9401),
+            learner_metrics: local(9402),
+            actor_metrics: local(0),
+        }
+    }
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            preset: "laptop".into(),
+            run: "getup".into(),
+            seed: 0,
+            steps: 0,
+            task: TaskConfig::default(),
+            actor: ActorConfig::default(),
+            replay: ReplayTable::default(),
+            sac: SacConfig::default(),
+            curriculum: CurriculumConfig::default(),
+            evaluation: EvaluationConfig::default(),
+            learner: LearnerConfig::default(),
+            network: NetworkConfig::default(),
+        }
+    }
+}
+
+/// Where a role's configuration comes from: what every role's command line shares.
+#[derive(Args, Clone, Debug, Default)]
+pub(crate) struct ConfigArgs {
+    /// Settings to start from: `smoke` (a minute, for tests), `laptop` (two to eight cores), `paper` (Table 1 of
+    /// the paper to the letter), `gpu`. [default: laptop]
+    #[arg(long, value_name = "NAME")]
+    pub(crate) preset: Option<String>,
+    /// A configuration file over the preset, such as a run's own config.toml.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<std::path::PathBuf>,
+    /// One setting over everything else, such as `--set sac.batch=256`; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub(crate) set: Vec<String>,
+}
+
+impl ConfigArgs {
+    /// Preset, file, environment (`GETUP_SAC__BATCH=256`), `--set`: each over the ones before.
+    pub(crate) fn load(&self) -> Result<Config> {
+        let mut layers = Layers::new()?;
+        let file = self.config.as_deref().map(read_table).transpose()?;
+        let from_file = file.as_ref().and_then(|table| table.get("preset")).and_then(|value| value.as_str());
+        layers.preset(self.preset.as_deref().or(from_file).unwrap_or("laptop"))?;
+        if let (Some(path), Some(table)) = (&self.config, file) {
+            layers.overlay(&path.display().to_string(), table)?;
+        }
+        layers.environment(std::env::vars())?;
+        for assignment in &self.set {
+            layers.set("--set", assignment)?;
+        }
+        if let Some(preset) = &self.preset {
+            layers.set("--preset", &format!("preset={preset}"))?;
+        }
+        layers.finish()
+    }
+}
+
+fn read_table(path: &Path) -> Result<toml::Table> {
+    let text = std::fs::read_to_string(path)
+        .with_context(|| format!("cannot read the configuration {}", path.display()))?;
+    text.parse().with_context(|| format!("{} is not TOML", path.display()))
+}
+
+impl Config {
+    /// Refuses settings that cannot work, alone or together.
+    pub(crate) fn validate(&self) -> Result<()> {
+        self.task.validate()?;
+        self.actor.validate()?;
+        self.replay_config().validate_for(&self.run_spec()?)?;
+        self.sac.validate()?;
+        self.curriculum.validate()?;
+        self.evaluation.validate()?;
+        self.learner.validate()?;
+        anyhow::ensure!(
+            !self.run.is_empty() && self.run.len() <= 128,
+            "run = {:?}: a run's name has 1 to 128 bytes",
+            self.run
+        );
+        Ok(())
+    }
+
+    /// The file's text.
+    pub(crate) fn to_toml(&self) -> Result<String> {
+        toml::to_string_pretty(self).context("the configuration is not expressible in TOML")
+    }
+
+    /// The replay's settings: it is sampled as often as `[sac]` says, once its uniform steps are there.
+    pub(crate) fn replay_config(&self) -> ReplayConfig {
+        ReplayConfig {
+            capacity: self.replay.capacity,
+            sync: self.replay.sync,
+            min_size: self.sac.uniform_steps.max(1),
+            samples_per_insert: Some(self.sac.updates_per_step * self.sac.batch as f64),
+            ..ReplayConfig::default()
+        }
+    }
+
+    /// What the run's transitions look like.
+    pub(crate) fn run_spec(&self) -> Result<RunSpec> {
+        let task = GetUp::new(&self.task, self.control_limit())?;
+        let column = |name: &str, width, rows| ColumnSpec { name: name.into(), width, rows };
+        Ok(RunSpec {
+            run: self.run.clone(),
+            task: format!("{}/{}", self.task.name, self.task.character),
+            columns: vec![
+                column(columns::OBSERVATION, task.observation_width(), Rows::StepsPlusOne),
+                column(columns::ACTION, task.action_width(), Rows::Steps),
+                column(columns::REWARD, 1, Rows::Steps),
+                column(columns::BETA, 1, Rows::Once),
+            ],
+            max_segment_steps: self.actor.segment_steps,
+        })
+    }
+
+    /// How an episode's β̂ is drawn around β^i.
+    pub(crate) fn beta_draw(&self) -> BetaDraw {
+        let CurriculumConfig { beta_std, beta_floor, beta_start, .. } = self.curriculum;
+        BetaDraw { std: beta_std, floor: beta_floor, ceiling: beta_start }
+    }
+
+    /// The clamp of the actuators: β̂ above 1 widens it.
+    pub(crate) fn control_limit(&self) -> f64 {
+        self.curriculum.beta_start.max(1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(arguments: &[&str], environment: &[(&str, &str)]) -> Result<Config> {
+        let mut layers = Layers::new()?;
+        layers.preset("paper")?;
+        layers.environment(environment.iter().map(|(key, value)| (key.to_string(), value.to_string())))?;
+        for assignment in arguments {
+            layers.set("--set", assignment)?;
+        }
+        layers.finish()
+    }
+
+    #[test]
+    fn every_preset_is_valid() {
+        for preset in layers::PRESETS {
+            let arguments = ConfigArgs { preset: Some(preset.0.into()), ..ConfigArgs::default() };
+            let config = arguments.load().unwrap();
+            assert_eq!(config.preset, preset.0);
+            let text = config.to_toml().unwrap();
+            assert_eq!(toml::from_str::<Config>(&text).unwrap(), config);
+        }
+    }
+
+    #[test]
+    fn the_paper_preset_is_table_1() {
+        let config = load(&[], &[]).unwrap();
+        let sac = &config.sac;
+        assert_eq!((sac.hidden.as_slice(), sac.critics, sac.batch), ([1024, 1024].as_slice(), 2, 1024));
+        assert_eq!((sac.actor_lr, sac.critic_lr, sac.temperature_lr), (1e-5, 1e-4, 1e-4));
+        assert_eq!((sac.gamma, sac.tau, sac.initial_temperature, sac.n_step), (0.97, 0.005, 0.1, 1));
+        assert_eq!((sac.updates_per_step, sac.uniform_steps, sac.normalize_observations), (1.0, 10_000, false));
+        assert_eq!(sac.target_entropy.nats(21), -21.0);
+        assert_eq!(config.replay.capacity, 1_000_000);
+        assert!(config.actor.store_limp);
+        let curriculum = &config.curriculum;
+        assert_eq!((curriculum.beta_start, curriculum.beta_floor, curriculum.decay), (1.0, 0.4, 0.95));
+        assert_eq!((curriculum.omega, curriculum.beta_std), (60.0, 0.04));
+        assert_eq!((curriculum.n_min, curriculum.n_max), (300_000, 800_000));
+        assert_eq!((config.evaluation.every, config.evaluation.episodes), (20_000, 10));
+        assert_eq!(config.task, TaskConfig::default());
+    }
+
+    #[test]
+    fn later_layers_win() {
+        let environment = [("GETUP_SAC__BATCH", "64"), ("GETUP_SEED", "7"), ("GETUP_TEST_FULL", "1"), ("HOME", "/")];
+        let config = load(&["sac.batch=32", "sac.hidden=[8, 8]", "run=arms", "sac.target_entropy=-4"], &environment);
+        let config = config.unwrap();
+        assert_eq!((config.sac.batch, config.seed, config.run.as_str()), (32, 7, "arms"));
+        assert_eq!((config.sac.hidden, config.sac.target_entropy.nats(21)), (vec![8, 8], -4.0));
+    }
+
+    #[test]
+    fn an_unknown_key_suggests_the_nearest_and_a_bad_value_is_named() {
+        let error = |arguments: &[&str]| format!("{:#}", load(arguments, &[]).unwrap_err());
+        assert_eq!(error(&["sac.bach=3"]), "--set: unknown setting sac.bach; did you mean sac.batch?");
+        assert!(error(&["sac=3"]).contains("sac is a table"), "{}", error(&["sac=3"]));
+        assert!(error(&["batch"]).contains("KEY=VALUE"));
+        let text = error(&["sac.batch=many"]);
+        assert!(text.contains("sac.batch") && text.contains("many"), "{text}");
+        assert!(error(&["curriculum.n_min=900000"]).contains("curriculum.n_min = 900000"));
+        let text = format!("{:#}", load(&[], &[("GETUP_SAC__BACH", "3")]).unwrap_err());
+        assert_eq!(text, "GETUP_SAC__BACH: unknown setting sac.bach; did you mean sac.batch?");
+        assert!(Layers::new().unwrap().preset("labtop").unwrap_err().to_string().contains("laptop"));
+    }
+}

@@ -1,0 +1,126 @@
+//! `getup learner`: the learner as a process; and what the one-process trainer shares with it.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Result;
+use getup_learner::hub::Hub;
+use getup_learner::device::{self, Device};
+use getup_learner::run_folder::{RunFolder, write_atomically};
+use getup_learner::sac::TaskShape;
+use getup_learner::service::service;
+use getup_learner::trainer::{Ending, Trainer, TrainerConfig};
+use getup_replay::{RemoteSource, SampleOptions};
+use getup_sim::{GetUp, Task};
+use getup_telemetry::health;
+use tokio_stream::wrappers::TcpListenerStream;
+
+use crate::config::Config;
+use crate::links::evaluation_seeds;
+use crate::role::{Role, RoleArgs, bind};
+
+/// Run the learner: trains on the replay's minibatches, broadcasts policies, leases evaluations, advances the
+/// curriculum. It resumes the run it finds in its folder; when the curriculum has ended it goes on serving the final
+/// policy until SIGTERM.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    role: RoleArgs,
+    /// The run's folder: checkpoints, models, evaluations. [default: runs/<name of the run>]
+    #[arg(long, value_name = "DIR")]
+    run: Option<PathBuf>,
+}
+
+pub(crate) fn run(arguments: Args) -> Result<()> {
+    let config = arguments.role.config.load()?;
+    let role = Role::new("learner", arguments.role.log_format)?;
+    let folder = RunFolder::new(arguments.run.unwrap_or_else(|| PathBuf::from("runs").join(&config.run)));
+    let device = device::open(config.learner.device, config.learner.effective_threads())?;
+    role.run(serve(&config, &role, folder, device))
+}
+
+async fn serve(config: &Config, role: &Role, folder: RunFolder, device: Device) -> Result<()> {
+    folder.create()?;
+    write_atomically(&folder.config(), config.to_toml()?.as_bytes())?;
+    let (hub, incarnation) = make_hub(config, role, &folder)?;
+    let address = &config.network.learner;
+    let listener = bind(address, "gRPC").await?;
+    role.serve_metrics(&config.network.learner_metrics).await?;
+    tracing::info!("learner serves gRPC at {}", listener.local_addr()?);
+    let (_reporter, health) = health();
+    let ended = role.shutdown.clone();
+    let server = tonic::transport::Server::builder()
+        .add_service(health)
+        .add_service(service(Arc::clone(&hub), role.shutdown.clone()))
+        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move { ended.wait().await });
+    let server = tokio::spawn(server);
+    let mut trainer = make_trainer(config, role, folder, hub, incarnation, device, true)?;
+    let replay = format!("http://{}", config.network.replay);
+    let spec = config.run_spec()?;
+    let options = sample_options(config, incarnation);
+    let mut source = RemoteSource::connect(&replay, spec, options, role.waits.clone(), role.shutdown.clone())?;
+    let shutdown = role.shutdown.clone();
+    let result = tokio::task::spawn_blocking(move || trainer.run(&mut source, &shutdown)).await?;
+    match &result {
+        Ok(Ending::Shutdown) | Err(_) => {}
+        Ok(_) => {
+            tracing::info!("finished: serving the final policy until SIGTERM");
+            role.shutdown.wait().await;
+        }
+    }
+    role.shutdown.trigger();
+    server.await??;
+    Ok(result.map(drop)?)
+}
+
+/// The meeting place of this learner and its actors, and the number of this start of a learner on the run.
+pub(crate) fn make_hub(config: &Config, role: &Role, folder: &RunFolder) -> Result<(Arc<Hub>, u64)> {
+    let incarnation = folder.next_incarnation()?;
+    let seeds = evaluation_seeds(config.seed, config.evaluation.episodes);
+    let keep_alive = Duration::from_secs_f64(config.evaluation.lease_seconds);
+    let hub = Hub::new(config.run_spec()?, seeds, keep_alive, incarnation, role.waits.clone());
+    Ok((Arc::new(hub), incarnation))
+}
+
+/// The trainer of this run, on its newest checkpoint where it resumes.
+pub(crate) fn make_trainer(
+    config: &Config,
+    role: &Role,
+    folder: RunFolder,
+    hub: Arc<Hub>,
+    incarnation: u64,
+    device: Device,
+    resume: bool,
+) -> Result<Trainer> {
+    let task = GetUp::new(&config.task, config.control_limit())?;
+    let observation = task.observation_width();
+    let trainer = TrainerConfig {
+        run: config.run.clone(),
+        character: config.task.character.to_string(),
+        seed: config.seed,
+        steps: (config.steps > 0).then_some(config.steps),
+        // β̂ is the last number of an observation.
+        shape: TaskShape { observation, action: task.action_width(), unnormalized: vec![observation - 1] },
+        sac: config.sac.clone(),
+        curriculum: config.curriculum.clone(),
+        evaluation: config.evaluation.clone(),
+        learner: config.learner.clone(),
+    };
+    Ok(Trainer::new(trainer, folder, hub, incarnation, resume, device, &role.registry)?)
+}
+
+/// How the learner samples; each of its starts draws other minibatches.
+pub(crate) fn sample_options(config: &Config, incarnation: u64) -> SampleOptions {
+    SampleOptions {
+        batch: config.sac.batch,
+        n_step: config.sac.n_step,
+        gamma: config.sac.gamma as f32,
+        seed: config.seed.wrapping_add(incarnation << 32),
+    }
+}
+
+/// What `getup doctor` says of libtorch and the configured device.
+pub(crate) fn check_device(config: &Config) -> Result<String> {
+    Ok(device::check(config.learner.device)?)
+}

@@ -1,0 +1,104 @@
+//! What every role's process has beside its work: logs, metrics, health, a runtime, and an orderly end.
+
+use std::future::Future;
+use std::io::{self, Write};
+use std::net::SocketAddr;
+
+use anyhow::{Context, Result};
+use getup_telemetry::{LogFormat, Registry, Shutdown, Waits, build_info, init_logging, serve_http};
+use indicatif::MultiProgress;
+use tokio::net::TcpListener;
+
+use crate::config::ConfigArgs;
+
+/// What every role's command line shares.
+#[derive(clap::Args, Clone, Debug)]
+pub(crate) struct RoleArgs {
+    #[command(flatten)]
+    pub(crate) config: ConfigArgs,
+    /// How log lines are written: pretty or json.
+    #[arg(long, value_name = "FORMAT", default_value = "pretty")]
+    pub(crate) log_format: LogFormat,
+}
+
+/// A process in the making: what its parts share.
+#[derive(Clone)]
+pub(crate) struct Role {
+    pub(crate) registry: Registry,
+    pub(crate) waits: Waits,
+    pub(crate) shutdown: Shutdown,
+    /// Where progress bars go; log lines step aside for them.
+    pub(crate) progress: MultiProgress,
+}
+
+impl Role {
+    /// Sets up logs and a registry for the role of this name.
+    pub(crate) fn new(name: &str, log_format: LogFormat) -> Result<Self> {
+        let progress = MultiProgress::new();
+        let writer = progress.clone();
+        init_logging(log_format, move || LogWriter(writer.clone()))?;
+        let registry = Registry::new();
+        build_info(&registry, name);
+        Ok(Self { waits: Waits::new(&registry), registry, shutdown: Shutdown::new(), progress })
+    }
+
+    /// Runs `work` on a runtime of its own until it ends; SIGTERM and Ctrl-C trigger the shutdown that it awaits.
+    pub(crate) fn run<T>(&self, work: impl Future<Output = Result<T>>) -> Result<T> {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .enable_all()
+            .build()
+            .context("cannot start the asynchronous runtime")?;
+        runtime.block_on(async {
+            self.shutdown.on_signals().context("cannot watch for signals")?;
+            work.await
+        })
+    }
+
+    /// Serves `/metrics` at `address` until shutdown; returns where.
+    pub(crate) async fn serve_metrics(&self, address: &str) -> Result<SocketAddr> {
+        let listener = bind(address, "metrics").await?;
+        let bound = listener.local_addr()?;
+        tracing::info!("metrics at http://{bound}/metrics");
+        let (registry, shutdown) = (self.registry.clone(), self.shutdown.clone());
+        tokio::spawn(async move {
+            if let Err(error) = serve_http(listener, registry, shutdown).await {
+                tracing::error!(%error, "/metrics is not served any more");
+            }
+        });
+        Ok(bound)
+    }
+}
+
+/// Binds a listener, or says which address could not be had and what to do.
+pub(crate) async fn bind(address: &str, what: &str) -> Result<TcpListener> {
+    TcpListener::bind(address).await.with_context(|| {
+        format!("cannot listen at {address} for {what}: is it taken? choose another with --set network.…=HOST:PORT")
+    })
+}
+
+/// A role that another reaches has to say so to whoever starts it.
+pub(crate) fn host_name() -> String {
+    let mut buffer = [0u8; 256];
+    // SAFETY: the buffer is valid for its length, of which one byte is kept for the terminator.
+    let result = unsafe { libc::gethostname(buffer.as_mut_ptr().cast(), buffer.len() - 1) };
+    let length = buffer.iter().position(|byte| *byte == 0).unwrap_or(0);
+    match std::str::from_utf8(&buffer[..length]) {
+        Ok(name) if result == 0 && !name.is_empty() => name.to_owned(),
+        _ => "host".to_owned(),
+    }
+}
+
+/// Writes to stderr between two drawings of the progress bar.
+struct LogWriter(MultiProgress);
+
+impl Write for LogWriter {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.suspend(|| io::stderr().write_all(bytes))?;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        io::stderr().flush()
+    }
+}

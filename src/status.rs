@@ -1,0 +1,141 @@
+//! `getup status`: who waits on whom, and why.
+
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+use getup_proto::v1;
+use getup_proto::v1::learner_client::LearnerClient;
+use getup_proto::v1::replay_client::ReplayClient;
+use serde_json::json;
+use tonic::transport::Endpoint;
+
+use crate::config::ConfigArgs;
+
+const TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Ask a running cluster who waits on whom, and why.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    config: ConfigArgs,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    json: bool,
+}
+
+#[tokio::main(flavor = "current_thread")]
+pub(crate) async fn run(arguments: Args) -> Result<()> {
+    let config = arguments.config.load()?;
+    let (replay, learner) = (&config.network.replay, &config.network.learner);
+    let (replay, learner) = tokio::join!(ask_replay(replay), ask_learner(learner));
+    if arguments.json {
+        let replay = replay.as_ref().map_or_else(|error| json!({"error": format!("{error:#}")}), replay_json);
+        let learner = learner.as_ref().map_or_else(|error| json!({"error": format!("{error:#}")}), learner_json);
+        println!("{}", json!({"replay": replay, "learner": learner}));
+        return Ok(());
+    }
+    match &replay {
+        Ok(reply) => print_replay(reply),
+        Err(error) => println!("replay   not reached: {error:#}"),
+    }
+    match &learner {
+        Ok(reply) => print_learner(reply),
+        Err(error) => println!("learner  not reached: {error:#}"),
+    }
+    anyhow::ensure!(replay.is_ok() || learner.is_ok(), "no role answers: is the cluster running?");
+    Ok(())
+}
+
+async fn channel(address: &str) -> Result<tonic::transport::Channel> {
+    let endpoint = Endpoint::from_shared(format!("http://{address}")).with_context(|| format!("{address:?}"))?;
+    let endpoint = endpoint.connect_timeout(TIMEOUT).timeout(TIMEOUT);
+    endpoint.connect().await.with_context(|| format!("nothing answers at {address}"))
+}
+
+async fn ask_replay(address: &str) -> Result<v1::DescribeReply> {
+    let mut client = ReplayClient::new(channel(address).await?);
+    Ok(client.describe(v1::DescribeRequest {}).await?.into_inner())
+}
+
+async fn ask_learner(address: &str) -> Result<v1::StatusReply> {
+    let mut client = LearnerClient::new(channel(address).await?);
+    Ok(client.status(v1::StatusRequest {}).await?.into_inner())
+}
+
+fn version(version: Option<v1::PolicyVersion>) -> String {
+    getup_proto::PolicyVersion::from(version.unwrap_or_default()).to_string()
+}
+
+fn or_nobody(waiting: &str) -> &str {
+    if waiting.is_empty() { "nobody waits" } else { waiting }
+}
+
+fn print_replay(reply: &v1::DescribeReply) {
+    let counters = reply.counters.unwrap_or_default();
+    let limiter = reply.limiter.clone().unwrap_or_default();
+    println!(
+        "replay   {} of {} transitions, {} env steps in {} episodes, {} sampled",
+        reply.size, reply.capacity, counters.env_steps, counters.episodes, counters.sampled
+    );
+    println!("         {}", or_nobody(&limiter.waiting));
+    for writer in &reply.writers {
+        println!("         writer {}: {} segments, silent for {:.0} s", writer.name, writer.durable_sequence, writer.silent_seconds);
+    }
+}
+
+fn print_learner(reply: &v1::StatusReply) {
+    println!(
+        "learner  {}: run {}, {} env steps, {} updates ({:.0}/s), stage {}, β = {:.3}",
+        reply.state, reply.run, reply.env_steps, reply.updates, reply.updates_per_second, reply.stage, reply.beta
+    );
+    println!("         {}", or_nobody(&reply.waiting));
+    if let Some(evaluation) = &reply.evaluation {
+        let (at, mean, min) = (evaluation.env_steps, evaluation.mean, evaluation.min);
+        println!("         last evaluation at {at} env steps: mean {mean:.1}, minimum {min:.1}");
+    }
+    for actor in &reply.actors {
+        let activity = if actor.waiting.is_empty() { "steps" } else { actor.waiting.as_str() };
+        println!(
+            "actor    {}: {activity}; {} env steps, policy {}, silent for {:.0} s{}",
+            actor.name,
+            actor.env_steps,
+            version(actor.version),
+            actor.silent_seconds,
+            if actor.lease > 0 { ", evaluates" } else { "" }
+        );
+    }
+}
+
+fn replay_json(reply: &v1::DescribeReply) -> serde_json::Value {
+    let counters = reply.counters.unwrap_or_default();
+    let limiter = reply.limiter.clone().unwrap_or_default();
+    json!({
+        "size": reply.size, "capacity": reply.capacity,
+        "memory_bytes": reply.memory_bytes, "disk_bytes": reply.disk_bytes,
+        "env_steps": counters.env_steps, "transitions": counters.transitions,
+        "episodes": counters.episodes, "sampled": counters.sampled,
+        "waiting": limiter.waiting,
+        "limiter": {"cursor": limiter.cursor, "min": limiter.min_cursor, "max": limiter.max_cursor},
+        "writers": reply.writers.iter().map(|writer| json!({
+            "name": writer.name, "segments": writer.durable_sequence, "silent_seconds": writer.silent_seconds,
+        })).collect::<Vec<_>>(),
+    })
+}
+
+fn learner_json(reply: &v1::StatusReply) -> serde_json::Value {
+    json!({
+        "run": reply.run, "state": reply.state, "waiting": reply.waiting,
+        "env_steps": reply.env_steps, "updates": reply.updates, "updates_per_second": reply.updates_per_second,
+        "stage": reply.stage, "beta": reply.beta,
+        "stage_env_steps": reply.stage_env_steps, "stage_limit": reply.stage_limit,
+        "version": version(reply.version),
+        "evaluation": reply.evaluation.as_ref().map(|evaluation| json!({
+            "env_steps": evaluation.env_steps, "mean": evaluation.mean, "min": evaluation.min,
+            "beta": evaluation.beta, "version": version(evaluation.version),
+        })),
+        "actors": reply.actors.iter().map(|actor| json!({
+            "name": actor.name, "env_steps": actor.env_steps, "version": version(actor.version),
+            "silent_seconds": actor.silent_seconds, "waiting": actor.waiting, "lease": actor.lease,
+        })).collect::<Vec<_>>(),
+    })
+}

@@ -1,0 +1,212 @@
+//! `getup train`: all roles in one process. The same parts as in a cluster, without the network between them.
+
+mod deterministic;
+mod progress;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context, Result, bail, ensure};
+use getup_actor::identity::Identity;
+use getup_actor::worker;
+use getup_learner::config::Device;
+use getup_learner::curriculum::Outcome;
+use getup_learner::device;
+use getup_learner::run_folder::{RunFolder, write_atomically};
+use getup_learner::trainer::Ending;
+use getup_replay::{LocalSource, Store};
+use getup_telemetry::LogFormat;
+
+use crate::config::{Config, ConfigArgs};
+use crate::learner::{make_hub, make_trainer, sample_options};
+use crate::links::{HubLink, StoreWriter};
+use crate::role::Role;
+
+/// Train a character in one process: simulation, replay, learner and curriculum.
+///
+/// Everything a run leaves is in its folder. Ctrl-C saves and ends; `--resume` goes on.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    config: ConfigArgs,
+    /// The run's folder. [default: runs/<preset>-<seed>]
+    #[arg(long, value_name = "DIR")]
+    run: Option<PathBuf>,
+    /// Go on with the run in that folder, under its own config.toml.
+    #[arg(long)]
+    resume: bool,
+    /// Every random draw comes from it. [default: 0]
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Env steps of the whole run. [default: until the curriculum ends]
+    #[arg(long)]
+    steps: Option<u64>,
+    /// One lane thread and a fixed interleaving: the same seed repeats evaluations.jsonl byte for byte on the same
+    /// machine. Slower: simulation and updates take turns.
+    #[arg(long)]
+    deterministic: bool,
+    /// cpu, or cuda for the first NVIDIA device. [default: the preset's]
+    #[arg(long)]
+    device: Option<Device>,
+    /// How log lines are written: pretty or json.
+    #[arg(long, value_name = "FORMAT", default_value = "pretty")]
+    log_format: LogFormat,
+}
+
+pub(crate) fn run(mut arguments: Args) -> Result<()> {
+    let (config, folder) = prepare(&mut arguments)?;
+    let role = Role::new("train", arguments.log_format)?;
+    let ending = if arguments.deterministic {
+        role.run(async { tokio::task::block_in_place(|| deterministic::train(&config, &role, &folder, arguments.resume)) })
+    } else {
+        role.run(train(&config, &role, &folder, arguments.resume))
+    }?;
+    conclude(ending, &folder, &arguments);
+    Ok(())
+}
+
+/// The run's configuration and folder, which is new unless the run is resumed.
+fn prepare(arguments: &mut Args) -> Result<(Config, RunFolder)> {
+    let shorthands = [
+        arguments.seed.map(|seed| format!("seed={seed}")),
+        arguments.steps.map(|steps| format!("steps={steps}")),
+        arguments.device.map(|device| format!("learner.device={}", if device == Device::Cuda { "cuda" } else { "cpu" })),
+    ];
+    arguments.config.set.extend(shorthands.into_iter().flatten());
+    if arguments.resume {
+        return prepare_resumed(arguments);
+    }
+    let mut config = arguments.config.load()?;
+    let path = arguments.run.clone().unwrap_or_else(|| format!("runs/{}-{}", config.preset, config.seed).into());
+    if path.join("config.toml").exists() {
+        let shown = path.display();
+        bail!("{shown} holds a run already: go on with it by `--resume --run {shown}`, or choose another --run");
+    }
+    name_after_folder(&mut config, &path);
+    let folder = RunFolder::new(path);
+    folder.create()?;
+    write_atomically(&folder.config(), config.to_toml()?.as_bytes())?;
+    Ok((config, folder))
+}
+
+fn prepare_resumed(arguments: &mut Args) -> Result<(Config, RunFolder)> {
+    let preset = arguments.config.preset.take();
+    let path = match (&arguments.run, &preset) {
+        (Some(path), _) => path.clone(),
+        (None, preset) => {
+            let seed = arguments.seed.unwrap_or(0);
+            format!("runs/{}-{seed}", preset.as_deref().unwrap_or("laptop")).into()
+        }
+    };
+    let folder = RunFolder::new(path);
+    let file = folder.config();
+    ensure!(file.exists(), "--resume: there is no run in {}: name its folder with --run", folder.root().display());
+    ensure!(arguments.config.config.is_none(), "--resume starts from the run's own config.toml, not from --config");
+    arguments.config.config = Some(file);
+    let config = arguments.config.load()?;
+    if let Some(preset) = preset
+        && preset != config.preset
+    {
+        bail!(
+            "--resume: the run in {} has preset {}, not {preset}: leave --preset out, or train a new run",
+            folder.root().display(),
+            config.preset
+        );
+    }
+    write_atomically(&folder.config(), config.to_toml()?.as_bytes())?;
+    Ok((config, folder))
+}
+
+/// A run that has no name of its own is called like its folder.
+fn name_after_folder(config: &mut Config, path: &Path) {
+    if config.run == Config::default().run
+        && let Some(name) = path.file_name().and_then(|name| name.to_str())
+    {
+        config.run = name.to_owned();
+    }
+}
+
+async fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bool) -> Result<Ending> {
+    let device = device::open(config.learner.device, config.learner.effective_threads())?;
+    serve_metrics(config, role).await?;
+    let spec = config.run_spec()?;
+    let store = open_store(config, role, folder)?;
+    let (hub, incarnation) = make_hub(config, role, folder)?;
+    let mut trainer = make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, resume)?;
+    let options = sample_options(config, incarnation);
+    let mut source = LocalSource::new(Arc::clone(&store), options, role.waits.clone(), role.shutdown.clone())?;
+    let bar = progress::Progress::start(role, config, Arc::clone(&hub), Arc::clone(&store));
+
+    let identity = Identity::new(&config.actor.name, config.seed);
+    let setup = crate::actor::setup(config, identity, folder.root().join("diverged"))?;
+    let writer = StoreWriter { store: Arc::clone(&store), shutdown: role.shutdown.clone() };
+    let link = HubLink { hub: Arc::clone(&hub), spec, name: config.actor.name.clone() };
+    let acting = {
+        let role = role.clone();
+        tokio::spawn(async move {
+            worker::run(setup, writer, link, role.waits.clone(), role.shutdown.clone(), &role.registry).await
+        })
+    };
+    let shutdown = role.shutdown.clone();
+    let mut training = tokio::task::spawn_blocking(move || trainer.run(&mut source, &shutdown));
+    let mut acting = acting;
+    let (trained, acted) = tokio::select! {
+        trained = &mut training => {
+            role.shutdown.trigger();
+            (trained, acting.await)
+        }
+        acted = &mut acting => {
+            role.shutdown.trigger();
+            (training.await, acted)
+        }
+    };
+    bar.finish().await;
+    let ending = trained.context("the training thread failed")?;
+    acted.context("the actor failed")??;
+    Ok(ending?)
+}
+
+fn open_store(config: &Config, role: &Role, folder: &RunFolder) -> Result<Arc<Store>> {
+    let spec = config.run_spec()?;
+    Ok(Store::open(&folder.replay(), &spec, &config.replay_config(), &role.registry)?)
+}
+
+/// Serves `/metrics`; where its port is taken, by another run on this machine, at any other.
+async fn serve_metrics(config: &Config, role: &Role) -> Result<()> {
+    let address = &config.network.learner_metrics;
+    if role.serve_metrics(address).await.is_err() {
+        tracing::warn!("{address} is taken: another port serves this run's metrics");
+        role.serve_metrics("127.0.0.1:0").await?;
+    }
+    Ok(())
+}
+
+/// Says how training ended and what to try next.
+fn conclude(ending: Ending, folder: &RunFolder, arguments: &Args) {
+    let shown = folder.root().display();
+    match ending {
+        Ending::Curriculum(Outcome::FloorPassed { beta }) => {
+            println!("Done: the curriculum went all the way, the weakest stage passed has β = {beta:.3}.");
+        }
+        Ending::Curriculum(Outcome::StageOutlasted { beta }) => {
+            println!("Done: the curriculum is over, the weakest stage passed has β = {beta:.3}.");
+        }
+        Ending::Steps(steps) => println!("Done: {steps} env steps."),
+        Ending::Shutdown => {
+            println!("Saved. Go on with: {} train --resume --run {shown}", program());
+            return;
+        }
+    }
+    let model = if folder.model("best").exists() { "best" } else { "last" };
+    println!("Evaluations: {}", folder.evaluations().display());
+    println!("Try it on unseen falls: {} evaluate {}", program(), folder.model(model).display());
+    if matches!(ending, Ending::Steps(_)) {
+        let more = arguments.steps.unwrap_or(0).saturating_mul(2);
+        println!("Train it further: {} train --resume --run {shown} --steps {more}", program());
+    }
+}
+
+/// How this program was called.
+fn program() -> String {
+    std::env::args().next().unwrap_or_else(|| "getup".into())
+}
