@@ -9,7 +9,7 @@ use clap::Args;
 use getup_actor::config::ActorConfig;
 use getup_actor::explore::BetaDraw;
 use getup_learner::config::{CurriculumConfig, EvaluationConfig, LearnerConfig, SacConfig};
-use getup_replay::{ReplayConfig, Sync};
+use getup_replay::{ReplayConfig, SyncMode};
 use getup_proto::{ColumnSpec, Rows, RunSpec, columns};
 use getup_sim::{GetUp, Task, TaskConfig};
 use serde::{Deserialize, Serialize};
@@ -45,7 +45,7 @@ pub(crate) struct ReplayTable {
     /// Transitions that can be sampled; the oldest go first.
     pub(crate) capacity: usize,
     /// What an acknowledged segment survives: `process` (a kill) or `data` (a power loss too).
-    pub(crate) sync: Sync,
+    pub(crate) sync: SyncMode,
 }
 
 impl Default for ReplayTable {

@@ -11,7 +11,7 @@ use getup_learner::run_folder::{RunFolder, write_atomically};
 use getup_learner::sac::TaskShape;
 use getup_learner::service::service;
 use getup_learner::trainer::{Ending, Trainer, TrainerConfig};
-use getup_replay::{RemoteSource, SampleOptions};
+use getup_replay::{RemoteOptions, RemoteSource, SampleOptions};
 use getup_sim::{GetUp, Task};
 use getup_telemetry::health;
 use tokio_stream::wrappers::TcpListenerStream;
@@ -19,6 +19,9 @@ use tokio_stream::wrappers::TcpListenerStream;
 use crate::config::Config;
 use crate::links::evaluation_seeds;
 use crate::role::{Role, RoleArgs, bind};
+
+/// Minibatches that are on their way while one is trained on.
+const PREFETCH: usize = 8;
 
 /// Run the learner: trains on the replay's minibatches, broadcasts policies, leases evaluations, advances the
 /// curriculum. It resumes the run it finds in its folder; when the curriculum has ended it goes on serving the final
@@ -56,10 +59,15 @@ async fn serve(config: &Config, role: &Role, folder: RunFolder, device: Device) 
         .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move { ended.wait().await });
     let server = tokio::spawn(server);
     let mut trainer = make_trainer(config, role, folder, hub, incarnation, device, true)?;
-    let replay = format!("http://{}", config.network.replay);
-    let spec = config.run_spec()?;
-    let options = sample_options(config, incarnation);
-    let mut source = RemoteSource::connect(&replay, spec, options, role.waits.clone(), role.shutdown.clone())?;
+    let options = RemoteOptions {
+        endpoint: config.network.replay.clone(),
+        spec: config.run_spec()?,
+        sample: sample_options(config, incarnation),
+        name: "learner".into(),
+        prefetch: PREFETCH,
+    };
+    let runtime = tokio::runtime::Handle::current();
+    let mut source = RemoteSource::new(options, &runtime, role.waits.clone(), role.shutdown.clone());
     let shutdown = role.shutdown.clone();
     let result = tokio::task::spawn_blocking(move || trainer.run(&mut source, &shutdown)).await?;
     match &result {

@@ -5,6 +5,7 @@
 
 use std::sync::Arc;
 
+use getup_actor::identity::Identity;
 use getup_actor::link::{LinkError, SegmentWriter};
 use getup_proto::Segment;
 use getup_replay::{Store, StoreError};
@@ -17,13 +18,38 @@ pub(crate) use learner::HubLink;
 
 /// Appends to a store in this process.
 pub(crate) struct StoreWriter {
-    pub(crate) store: Arc<Store>,
-    pub(crate) shutdown: Shutdown,
+    store: Arc<Store>,
+    writer: u64,
+    shutdown: Shutdown,
+}
+
+impl StoreWriter {
+    /// A writer with the id that its segments carry, under the name that `status` shows.
+    pub(crate) fn new(store: Arc<Store>, identity: &Identity, shutdown: Shutdown) -> Self {
+        store.introduce(identity.writer, &identity.name);
+        Self { store, writer: identity.writer, shutdown }
+    }
+}
+
+impl Drop for StoreWriter {
+    fn drop(&mut self) {
+        self.store.farewell(self.writer);
+    }
 }
 
 impl SegmentWriter for StoreWriter {
     async fn append(&mut self, segments: Vec<Segment>) -> Result<(), LinkError> {
-        Ok(())
+        let (store, shutdown) = (Arc::clone(&self.store), self.shutdown.clone());
+        let append = move || {
+            // At the end the limiter is not asked: what was simulated is kept. What it let in already is not
+            // stored again.
+            if shutdown.is_triggered() || !store.append_when_due(segments.clone(), &shutdown)? {
+                store.append(segments)?;
+            }
+            Ok::<(), StoreError>(())
+        };
+        let appended = tokio::task::spawn_blocking(append).await;
+        appended.map_err(|error| LinkError::Refused(error.to_string()))?.map_err(|error| LinkError::Refused(error.to_string()))
     }
 }
 

@@ -2,10 +2,9 @@
 
 use std::time::Duration;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, anyhow};
 use getup_proto::v1;
 use getup_proto::v1::learner_client::LearnerClient;
-use getup_proto::v1::replay_client::ReplayClient;
 use serde_json::json;
 use tonic::transport::Endpoint;
 
@@ -53,8 +52,8 @@ async fn channel(address: &str) -> Result<tonic::transport::Channel> {
 }
 
 async fn ask_replay(address: &str) -> Result<v1::DescribeReply> {
-    let mut client = ReplayClient::new(channel(address).await?);
-    Ok(client.describe(v1::DescribeRequest {}).await?.into_inner())
+    let asked = getup_replay::describe(address).await;
+    asked.map_err(|status| anyhow!("{address}: {}", status.message()))
 }
 
 async fn ask_learner(address: &str) -> Result<v1::StatusReply> {

@@ -14,7 +14,7 @@ use getup_learner::curriculum::Outcome;
 use getup_learner::device;
 use getup_learner::run_folder::{RunFolder, write_atomically};
 use getup_learner::trainer::Ending;
-use getup_replay::{LocalSource, Store};
+use getup_replay::{LocalSource, ReplayMetrics, Store};
 use getup_telemetry::LogFormat;
 
 use crate::config::{Config, ConfigArgs};
@@ -134,14 +134,14 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bool) -
     let (hub, incarnation) = make_hub(config, role, folder)?;
     let mut trainer = make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, resume)?;
     let options = sample_options(config, incarnation);
-    let mut source = LocalSource::new(Arc::clone(&store), options, role.waits.clone(), role.shutdown.clone())?;
-    let bar = progress::Progress::start(role, config, Arc::clone(&hub), Arc::clone(&store));
+    let mut source = LocalSource::new(Arc::clone(&store), options, "learner", role.shutdown.clone())?;
+    let bar = progress::Progress::start(role, config, Arc::clone(&hub));
 
     let identity = Identity::new(&config.actor.name, config.seed);
+    let writer = StoreWriter::new(store, &identity, role.shutdown.clone());
     let setup = crate::actor::setup(config, identity, folder.root().join("diverged"))?;
-    let writer = StoreWriter { store: Arc::clone(&store), shutdown: role.shutdown.clone() };
     let link = HubLink { hub: Arc::clone(&hub), spec, name: config.actor.name.clone() };
-    let acting = {
+    let mut acting = {
         let role = role.clone();
         tokio::spawn(async move {
             worker::run(setup, writer, link, role.waits.clone(), role.shutdown.clone(), &role.registry).await
@@ -149,7 +149,6 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bool) -
     };
     let shutdown = role.shutdown.clone();
     let mut training = tokio::task::spawn_blocking(move || trainer.run(&mut source, &shutdown));
-    let mut acting = acting;
     let (trained, acted) = tokio::select! {
         trained = &mut training => {
             role.shutdown.trigger();
@@ -168,7 +167,9 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bool) -
 
 fn open_store(config: &Config, role: &Role, folder: &RunFolder) -> Result<Arc<Store>> {
     let spec = config.run_spec()?;
-    Ok(Store::open(&folder.replay(), &spec, &config.replay_config(), &role.registry)?)
+    let metrics = ReplayMetrics::new(&role.registry);
+    let store = Store::open(&folder.replay(), &spec, &config.replay_config(), metrics, role.waits.clone())?;
+    Ok(Arc::new(store))
 }
 
 /// Serves `/metrics`; where its port is taken, by another run on this machine, at any other.

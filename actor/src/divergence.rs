@@ -29,7 +29,8 @@ impl DivergenceLog {
             tracing::warn!(actor = name, lane, episode, "{diverged}; not kept: {MOST_FILES} others are");
             return;
         }
-        let file = format!("{name}-{:016x}-lane{lane}-episode{episode}.json", identity.writer);
+        // Not the name: it may hold what a file name may not.
+        let file = format!("{:016x}-lane{lane}-episode{episode}.json", identity.writer);
         let path = self.folder.join(file);
         match write(&path, diverged) {
             Ok(()) => {

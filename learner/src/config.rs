@@ -49,10 +49,52 @@ pub struct SacConfig {
     pub updates_per_step: f64,
     /// Env steps of uniform actions before the first update.
     pub uniform_steps: u64,
+    /// Precision of the hidden layers' matrix products; weights, heads and losses are always float32.
+    pub precision: Precision,
     /// Whether observations are normalised by running statistics.
     pub normalize_observations: bool,
     /// Env steps after which those statistics no longer change.
     pub normalize_until: u64,
+}
+
+/// See [`SacConfig::precision`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Precision {
+    /// bfloat16 where the processor multiplies it (AVX512-BF16, AMX), float32 elsewhere.
+    Auto,
+    /// float32.
+    Fp32,
+    /// bfloat16, which is slow where the processor does not multiply it.
+    Bf16,
+}
+
+impl Precision {
+    /// Whether the products are in bfloat16 on this processor.
+    pub fn is_bf16(self) -> bool {
+        match self {
+            Self::Fp32 => false,
+            Self::Bf16 => true,
+            Self::Auto => multiplies_bf16(),
+        }
+    }
+
+    #[cfg(feature = "torch")]
+    pub(crate) fn kind(self, device: tch::Device) -> tch::Kind {
+        let bf16 = if device.is_cuda() { self != Self::Fp32 } else { self.is_bf16() };
+        if bf16 { tch::Kind::BFloat16 } else { tch::Kind::Float }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+fn multiplies_bf16() -> bool {
+    // Every processor with AMX-BF16 has AVX512-BF16 too.
+    is_x86_feature_detected!("avx512bf16")
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+fn multiplies_bf16() -> bool {
+    false
 }
 
 /// See [`SacConfig::target_entropy`].
@@ -99,6 +141,7 @@ impl Default for SacConfig {
             target_entropy: TargetEntropy::Auto(Auto::Auto),
             updates_per_step: 1.0,
             uniform_steps: 10_000,
+            precision: Precision::Fp32,
             normalize_observations: false,
             normalize_until: 300_000,
         }

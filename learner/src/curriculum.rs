@@ -87,6 +87,11 @@ impl Curriculum {
         Self { config, stage: 0, beta, stage_start: 0, stage_limit: None, passed: None, outcome: None }
     }
 
+    /// The same state under other settings: a resumed run may change them.
+    pub fn with_config(self, config: CurriculumConfig) -> Self {
+        Self { config, ..self }
+    }
+
     /// i, from 0.
     pub fn stage(&self) -> u32 {
         self.stage

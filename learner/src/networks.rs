@@ -1,8 +1,8 @@
 //! The actor and the critics on libtorch, built from the same shapes as `getup-policy`'s forward pass.
 
-use getup_policy::{Body, LOG_STD_MAX, LOG_STD_MIN, Policy, PolicyShape, init};
+use getup_policy::{LOG_STD_MAX, LOG_STD_MIN, Policy, PolicyShape, init};
 use rand::Rng;
-use tch::{Device, Tensor};
+use tch::{Device, Kind, Tensor};
 
 use crate::parameters::Parameters;
 
@@ -13,6 +13,8 @@ const LOG_SQRT_2PI: f64 = 0.918_938_533_204_672_7;
 pub(crate) struct Actor {
     pub(crate) shape: PolicyShape,
     pub(crate) parameters: Parameters,
+    /// Precision of the body's matrix products; the heads' are float32.
+    products: Kind,
 }
 
 /// Mean and log standard deviation of a Gaussian, `[B, action]` each.
@@ -28,19 +30,19 @@ pub(crate) struct Sample {
 }
 
 impl Actor {
-    pub(crate) fn new(policy: &Policy, device: Device) -> Self {
+    pub(crate) fn new(policy: &Policy, products: Kind, device: Device) -> Self {
         let values = policy.shape.tensors().into_iter().map(|(name, shape)| {
             let values = policy.tensor(&name).to_vec();
             (name, shape, values)
         });
-        Self { shape: policy.shape.clone(), parameters: Parameters::new(values.collect(), device) }
+        Self { shape: policy.shape.clone(), parameters: Parameters::new(values.collect(), device), products }
     }
 
     /// The Gaussian at observations `[B, observation]`, normalised before where the run normalises.
     pub(crate) fn forward(&self, observation: &Tensor) -> Gaussian {
         let leaves: Vec<&Tensor> = self.parameters.leaves().collect();
         let (body, heads) = leaves.split_at(leaves.len() - 4);
-        let hidden = relu_layers(observation, body);
+        let hidden = relu_layers(observation, body, self.products);
         let log_std = hidden.linear(heads[2], Some(heads[3])).tanh();
         let half = f64::from(LOG_STD_MAX - LOG_STD_MIN) / 2.0;
         Gaussian {
@@ -78,11 +80,20 @@ impl Gaussian {
 pub(crate) struct Critics {
     count: usize,
     pub(crate) parameters: Parameters,
+    /// Precision of the body's matrix products; the head's are float32, for Q must tell rewards apart.
+    products: Kind,
 }
 
 impl Critics {
     /// Orthogonal weights with gain 1, zero biases (App. D).
-    pub(crate) fn new(count: usize, policy: &PolicyShape, body: &Body, rng: &mut impl Rng, device: Device) -> Self {
+    pub(crate) fn new(
+        count: usize,
+        policy: &PolicyShape,
+        rng: &mut impl Rng,
+        products: Kind,
+        device: Device,
+    ) -> Self {
+        let body = &policy.body;
         let inputs = policy.observation + policy.action;
         let mut values = Vec::new();
         for critic in 0..count {
@@ -96,11 +107,11 @@ impl Critics {
             }
             add("head.value".into(), body.output_width(inputs), 1);
         }
-        Self { count, parameters: Parameters::new(values, device) }
+        Self { count, parameters: Parameters::new(values, device), products }
     }
 
     pub(crate) fn duplicate(&self) -> Self {
-        Self { count: self.count, parameters: self.parameters.duplicate() }
+        Self { count: self.count, parameters: self.parameters.duplicate(), products: self.products }
     }
 
     /// Q of every critic, `[critics, B]`.
@@ -111,7 +122,7 @@ impl Critics {
             .chunks(leaves.len() / self.count)
             .map(|critic| {
                 let (body, head) = critic.split_at(critic.len() - 2);
-                relu_layers(&input, body).linear(head[0], Some(head[1])).squeeze_dim(1)
+                relu_layers(&input, body, self.products).linear(head[0], Some(head[1])).squeeze_dim(1)
             })
             .collect();
         Tensor::stack(&values, 0)
@@ -123,15 +134,17 @@ impl Critics {
     }
 }
 
-/// Pairs of weight and bias, each followed by a ReLU.
-fn relu_layers(input: &Tensor, layers: &[&Tensor]) -> Tensor {
-    layers.chunks(2).fold(input.shallow_clone(), |x, layer| x.linear(layer[0], Some(layer[1])).relu())
+/// Pairs of weight and bias, each followed by a ReLU, with matrix products of `products` and a float32 result.
+fn relu_layers(input: &Tensor, layers: &[&Tensor], products: Kind) -> Tensor {
+    let layer = |x: Tensor, pair: &[&Tensor]| {
+        x.linear(&pair[0].to_kind(products), Some(pair[1].to_kind(products))).relu()
+    };
+    layers.chunks(2).fold(input.to_kind(products), layer).to_kind(Kind::Float)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use tch::Kind;
 
     #[test]
     fn the_probability_of_all_actions_is_one_for_every_beta() {

@@ -58,6 +58,7 @@ impl Parameters {
     }
 
     /// Overwrites all values. The length is the caller's to check.
+    #[cfg(test)]
     pub(crate) fn copy_from(&mut self, values: &[f32]) {
         let _guard = tch::no_grad_guard();
         self.flat.copy_(&Tensor::from_slice(values));

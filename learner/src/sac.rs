@@ -91,9 +91,10 @@ impl Sac {
     /// Untrained networks, drawn from `seed`.
     pub fn new(shape: &TaskShape, config: &SacConfig, seed: u64, device: Device) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let products = config.precision.kind(device);
         let policy = Policy::init(config.policy_shape(shape.observation, shape.action), &mut rng);
-        let critics = Critics::new(config.critics, &policy.shape, &policy.shape.body, &mut rng, device);
-        let actor = Actor::new(&policy, device);
+        let critics = Critics::new(config.critics, &policy.shape, &mut rng, products, device);
+        let actor = Actor::new(&policy, products, device);
         Self {
             target_entropy: config.target_entropy.nats(shape.action),
             device,

@@ -32,6 +32,9 @@ use pace::Pace;
 /// How long the end of training waits for evaluations that are still out.
 const LAST_REPORTS: Duration = Duration::from_secs(120);
 
+/// A learner that gets no minibatch looks after its evaluations this often.
+const STARVED: Duration = Duration::from_millis(500);
+
 /// Why training stopped.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
@@ -129,6 +132,8 @@ pub struct Trainer {
     pace: Pace,
     version: PolicyVersion,
     evaluation: Option<v1::EvaluationSummary>,
+    /// Updates behind the policy that was offered for evaluation last.
+    evaluated_updates: u64,
     ending: Option<Ending>,
 }
 
@@ -152,7 +157,7 @@ impl Trainer {
         let resumed = checkpoint.is_some();
         if let Some(checkpoint) = checkpoint {
             checkpoint.restore(&mut sac)?;
-            curriculum = checkpoint.curriculum;
+            curriculum = checkpoint.curriculum.with_config(config.curriculum.clone());
             progress = checkpoint.progress;
             tracing::info!(env_steps = progress.env_steps, updates = sac.updates(), "training resumes");
         }
@@ -163,6 +168,7 @@ impl Trainer {
             version: PolicyVersion { incarnation, counter: 0 },
             ending: curriculum.outcome().map(Ending::Curriculum),
             evaluation: None,
+            evaluated_updates: 0,
             config,
             sac,
             curriculum,
@@ -193,11 +199,12 @@ impl Trainer {
     pub fn run(&mut self, source: &mut dyn MinibatchSource, shutdown: &Shutdown) -> Result<Ending, TrainError> {
         while self.ending.is_none() && !shutdown.is_triggered() {
             let asked = Instant::now();
-            match source.next() {
-                Ok(minibatch) => {
+            match source.poll(STARVED) {
+                Ok(Some(minibatch)) => {
                     self.metrics.wait_seconds.observe(asked.elapsed().as_secs_f64());
                     self.tick(&minibatch)?;
                 }
+                Ok(None) => self.take_reports()?,
                 Err(SampleError::Shutdown) => break,
                 Err(error) => return Err(error.into()),
             }
@@ -236,8 +243,10 @@ impl Trainer {
             self.publish();
         }
         if self.config.steps.is_some_and(|steps| self.progress.env_steps >= steps) {
-            let policy = self.publish();
-            self.offer(policy);
+            if self.evaluated_updates < self.sac.updates() {
+                let policy = self.publish();
+                self.offer(policy);
+            }
             self.ending = Some(Ending::Steps(self.progress.env_steps));
         } else if self.checkpoints.due() {
             self.checkpoint();
@@ -392,6 +401,7 @@ impl Trainer {
     }
 
     fn offer(&mut self, policy: Arc<v1::PolicyUpdate>) {
+        self.evaluated_updates = self.sac.updates();
         self.hub.offer(Evaluation { policy, updates: self.sac.updates() });
     }
 

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 /// What an acknowledged segment survives.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Sync {
+pub enum SyncMode {
     /// The process being killed: the kernel has the data.
     #[default]
     Process,
@@ -31,7 +31,7 @@ pub struct ReplayConfig {
     /// `samples_per_insert`, and at least what two of the longest segments allow.
     pub error_buffer: Option<f64>,
     /// What an acknowledged segment survives.
-    pub sync: Sync,
+    pub sync: SyncMode,
 }
 
 impl Default for ReplayConfig {
@@ -42,7 +42,7 @@ impl Default for ReplayConfig {
             min_size: 1_000,
             samples_per_insert: None,
             error_buffer: None,
-            sync: Sync::Process,
+            sync: SyncMode::Process,
         }
     }
 }

@@ -15,7 +15,7 @@ pub enum StoreError {
     #[error(transparent)]
     Spec(#[from] SpecError),
     /// The store holds the transitions of another run.
-    #[error("the replay store {dir} belongs to another run: {source}")]
+    #[error("the replay store {dir} cannot be used here: {source}")]
     OtherRun {
         /// Where it is.
         dir: PathBuf,

@@ -3,6 +3,7 @@
 //! A wait can be cancelled, and can say why it lasts: `812 of 1,000 transitions; actor-3 silent for 14 s`.
 
 use crate::limiter::{Blocked, Limiter};
+use getup_proto::Segment;
 use getup_telemetry::{Shutdown, WaitGuard, Waits};
 use std::collections::HashMap;
 use std::fmt::Write;
@@ -44,6 +45,8 @@ pub(crate) struct Peer {
     pub(crate) heard: Instant,
     /// Open streams.
     pub(crate) connections: usize,
+    /// Of a writer: its greatest sequence number that is durable.
+    pub(crate) durable: u64,
 }
 
 /// Room for an insert that is under way; given back when dropped.
@@ -72,9 +75,17 @@ impl Gate {
         self.lock().limiter.clone()
     }
 
-    /// Counts env steps that are durable and can be sampled.
-    pub(crate) fn insert(&self, env_steps: u64) {
-        self.lock().limiter.insert(env_steps);
+    /// Counts segments that are durable and can be sampled.
+    pub(crate) fn insert(&self, segments: &[Segment]) {
+        let mut inner = self.lock();
+        for segment in segments {
+            inner.limiter.insert(u64::from(segment.env_steps));
+            if let Some(peer) = inner.writers.get_mut(&segment.writer) {
+                peer.heard = Instant::now();
+                peer.durable = segment.sequence;
+            }
+        }
+        drop(inner);
         self.wake();
     }
 
@@ -95,14 +106,19 @@ impl Gate {
         Ok(true)
     }
 
-    /// Waits until a sample of this size might be let through. False when `shutdown` or `patience` ends the wait.
-    pub(crate) fn wait_to_sample(&self, batch: u64, patience: Duration, shutdown: &Shutdown) -> bool {
-        let give_up = Instant::now() + patience;
+    /// Waits until a sample of this size might be let through. False when `cancelled` or `patience` ends the wait.
+    pub(crate) fn wait_to_sample(
+        &self,
+        batch: u64,
+        patience: Duration,
+        cancelled: impl Fn() -> bool,
+    ) -> bool {
+        let started = Instant::now();
         let mut wait = None;
         let mut inner = self.lock();
         while let Some(blocked) = inner.limiter.blocks_sample(batch) {
-            let left = give_up.saturating_duration_since(Instant::now());
-            if left.is_zero() || shutdown.is_triggered() {
+            let left = patience.saturating_sub(started.elapsed());
+            if left.is_zero() || cancelled() {
                 return false;
             }
             self.explain(&mut wait, "sampler", || inner.reason(&blocked, &inner.writers));
@@ -152,9 +168,9 @@ impl Gate {
         }
     }
 
-    /// A writer has come.
-    pub(crate) fn writer_came(&self, writer: u64, name: &str) {
-        came(&mut self.lock().writers, writer, name);
+    /// A writer has come, whose segments are durable up to this sequence number.
+    pub(crate) fn writer_came(&self, writer: u64, name: &str, durable: u64) {
+        came(&mut self.lock().writers, writer, name, durable);
     }
 
     /// A writer's segment has come.
@@ -173,7 +189,7 @@ impl Gate {
 
     /// A sampler has come.
     pub(crate) fn sampler_came(&self, sampler: u64, name: &str) {
-        came(&mut self.lock().samplers, sampler, name);
+        came(&mut self.lock().samplers, sampler, name, 0);
     }
 
     /// A sampler took a minibatch or asked for one.
@@ -193,11 +209,11 @@ impl Gate {
         self.lock().writers.iter().map(|(&writer, peer)| (writer, peer.clone())).collect()
     }
 
-    /// What the longest wait at this gate waits for; empty where nobody waits.
+    /// What the longest wait of this store waits for; empty where nobody waits.
     pub(crate) fn waiting(&self) -> String {
         let mut waits = self.waits.current().into_iter();
         waits
-            .find(|wait| matches!(wait.what, "sampler" | "writer"))
+            .find(|wait| matches!(wait.what, "sampler" | "writer" | "replay"))
             .map_or_else(String::new, |wait| wait.to_string())
     }
 
@@ -256,9 +272,9 @@ impl Inner {
     }
 }
 
-fn came(peers: &mut HashMap<u64, Peer>, id: u64, name: &str) {
+fn came(peers: &mut HashMap<u64, Peer>, id: u64, name: &str, durable: u64) {
     let connections = peers.get(&id).map_or(0, |peer| peer.connections) + 1;
-    peers.insert(id, Peer { name: name.to_owned(), heard: Instant::now(), connections });
+    peers.insert(id, Peer { name: name.to_owned(), heard: Instant::now(), connections, durable });
     if peers.len() > MOST_PEERS {
         let silent =
             peers.iter().filter(|(_, peer)| peer.connections == 0).min_by_key(|(_, peer)| peer.heard);

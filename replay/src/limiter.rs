@@ -84,7 +84,7 @@ impl Limiter {
         let inserts = self.inserts + self.reserved + env_steps;
         let waits = env_steps > 0 && self.cursor_at(inserts, self.samples) > band.max;
         waits.then_some(Blocked::InsertsAhead {
-            inserts: self.inserts,
+            inserts: self.inserts + self.reserved,
             samples: self.samples,
             samples_per_insert: band.samples_per_insert,
         })
@@ -127,11 +127,6 @@ impl Limiter {
     /// The most transitions that one sample may ever have; a larger one could wait forever.
     pub(crate) fn largest_sample(&self) -> f64 {
         self.band.map_or(f64::INFINITY, |band| (band.max - band.min) / 2.0)
-    }
-
-    /// Env steps inserted so far.
-    pub(crate) fn inserts(&self) -> u64 {
-        self.inserts
     }
 
     /// Transitions sampled so far.
@@ -187,7 +182,7 @@ fn thousands(number: u64) -> String {
     let digits = number.to_string();
     let mut text = String::with_capacity(digits.len() + digits.len() / 3);
     for (i, digit) in digits.chars().enumerate() {
-        if i > 0 && (digits.len() - i) % 3 == 0 {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
             text.push(',');
         }
         text.push(digit);

@@ -117,7 +117,7 @@ fn a_restart_under_the_same_settings_changes_nothing() {
     before.insert(14);
     before.sample(9);
     let mut after = limiter(10, Some(2.0), Some(20.0));
-    after.restore(before.inserts(), before.samples());
+    after.restore(before.inserts, before.samples());
     assert_eq!(after, before);
 }
 

@@ -1,6 +1,5 @@
 //! What sampling gives: [`Minibatch`], and how it is asked for: [`SampleOptions`].
 
-use bytes::Bytes;
 use getup_proto::{columns, v1};
 
 /// What a stream of minibatches is made of.
@@ -118,16 +117,9 @@ impl MinibatchColumn {
         let v1::MinibatchColumn { name, width, data } = wire;
         let width = width as usize;
         let values = width.checked_mul(batch)?;
-        (data.len() == values.checked_mul(columns::VALUE_BYTES)?).then(|| Self {
-            name,
-            width,
-            data: decode(&data),
-        })
+        let whole = data.len() == values.checked_mul(columns::VALUE_BYTES)?;
+        whole.then(|| Self { name, width, data: columns::iter(&data).collect() })
     }
-}
-
-fn decode(data: &Bytes) -> Vec<f32> {
-    columns::iter(data).collect()
 }
 
 impl From<v1::ReplayCounters> for ReplayCounters {

@@ -26,7 +26,7 @@ pub trait MinibatchSource: Send {
     /// As [`MinibatchSource::poll`].
     fn next(&mut self) -> Result<Minibatch, SampleError> {
         loop {
-            if let Some(minibatch) = self.poll(Duration::from_secs(60))? {
+            if let Some(minibatch) = self.poll(Duration::MAX)? {
                 return Ok(minibatch);
             }
         }
@@ -93,10 +93,13 @@ impl LocalSource {
     pub fn restore(&mut self, sampler: Sampler) {
         self.sampler = sampler;
     }
-}
 
-impl MinibatchSource for LocalSource {
-    fn poll(&mut self, patience: Duration) -> Result<Option<Minibatch>, SampleError> {
+    /// As [`MinibatchSource::poll`]; also None once `cancelled`.
+    pub(crate) fn poll_unless(
+        &mut self,
+        patience: Duration,
+        cancelled: impl Fn() -> bool,
+    ) -> Result<Option<Minibatch>, SampleError> {
         let gate = self.store.gate();
         gate.heard_sampler(self.id);
         loop {
@@ -107,10 +110,17 @@ impl MinibatchSource for LocalSource {
                 return Ok(Some(minibatch));
             }
             // Another sampler may be quicker than this one after the wait.
-            if !gate.wait_to_sample(self.options.batch as u64, patience, &self.shutdown) {
+            let cancelled = || cancelled() || self.shutdown.is_triggered();
+            if !gate.wait_to_sample(self.options.batch as u64, patience, cancelled) {
                 return if self.shutdown.is_triggered() { Err(SampleError::Shutdown) } else { Ok(None) };
             }
         }
+    }
+}
+
+impl MinibatchSource for LocalSource {
+    fn poll(&mut self, patience: Duration) -> Result<Option<Minibatch>, SampleError> {
+        self.poll_unless(patience, || false)
     }
 }
 

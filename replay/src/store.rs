@@ -6,7 +6,7 @@
 
 use crate::config::ReplayConfig;
 use crate::error::StoreError;
-use crate::gate::{Gate, Permit};
+use crate::gate::{Gate, Peer};
 use crate::gather::gather;
 use crate::limiter::Limiter;
 use crate::log::{self, Log, State, Watermark};
@@ -119,9 +119,10 @@ impl Store {
     /// Notes that a writer has come, under the name that logs and `status` show, and returns the greatest sequence
     /// number of it that is durable: it goes on from there. [`Store::farewell`] when it goes.
     pub fn introduce(&self, writer: u64, name: &str) -> u64 {
-        self.gate.writer_came(writer, name);
+        let durable = self.writing().log.durable(writer);
+        self.gate.writer_came(writer, name, durable);
         self.metrics.writers.inc();
-        self.writing().log.durable(writer)
+        durable
     }
 
     /// Notes that a writer that was introduced has gone.
@@ -179,8 +180,9 @@ impl Store {
     /// As [`Store::append`], for segments that were parsed.
     pub(crate) fn append_checked(&self, segments: Vec<Segment>) -> Result<(), StoreError> {
         let started = Instant::now();
-        let Some(newest) = segments.last() else { return Ok(()) };
-        self.gate.heard_writer(newest.writer);
+        if segments.is_empty() {
+            return Ok(());
+        }
         let wait = self.waits.begin("replay", format!("the disk takes {} segments", segments.len()));
         let mut writing = self.writing();
         let fresh = writing.log.append(segments)?;
@@ -196,7 +198,7 @@ impl Store {
         }
         let count = |of: fn(&Segment) -> u64| fresh.iter().map(of).sum::<u64>();
         let env_steps = count(|segment| u64::from(segment.env_steps));
-        self.gate.insert(env_steps);
+        self.gate.insert(&fresh);
 
         self.metrics.inserted_env_steps.inc_by(env_steps);
         self.metrics.inserted_transitions.inc_by(count(|segment| segment.steps as u64));
@@ -279,20 +281,17 @@ impl Store {
         self.len() == 0
     }
 
-    /// The spec, sizes, counters, and the limiter's state. Waits for an append that is under way.
+    /// The spec, sizes, counters, and the limiter's state.
     pub fn describe(&self) -> v1::DescribeReply {
         let limiter = self.gate.limiter();
         let (samples_per_insert, min_cursor, max_cursor) = limiter.band().unwrap_or_default();
-        let writers = self.gate.writers();
-        let writing = self.writing();
-        let writer = |(writer, peer): (u64, crate::gate::Peer)| v1::WriterState {
+        let writer = |(writer, peer): (u64, Peer)| v1::WriterState {
             name: peer.name,
             writer,
-            durable_sequence: writing.log.durable(writer),
+            durable_sequence: peer.durable,
             silent_seconds: peer.heard.elapsed().as_secs_f64(),
         };
-        let writers = writers.into_iter().map(writer).collect();
-        drop(writing);
+        let writers = self.gate.writers().into_iter().map(writer).collect();
         v1::DescribeReply {
             spec: Some(self.spec.to_wire()),
             counters: Some(self.counters().into()),
@@ -318,11 +317,6 @@ impl Store {
 
     pub(crate) fn metrics(&self) -> &ReplayMetrics {
         &self.metrics
-    }
-
-    /// Room for a segment, for the service: waits as a task.
-    pub(crate) async fn admit(&self, env_steps: u64) -> Permit {
-        self.gate.admit_task(env_steps).await
     }
 
     fn counters_of(&self, state: State, sampled: u64) -> ReplayCounters {

@@ -11,15 +11,16 @@ use anyhow::Result;
 use getup_actor::evaluate::Evaluator;
 use getup_actor::identity::Identity;
 use getup_actor::lanes::{LaneGroup, LaneSettings};
-use getup_actor::link::{Lease, PolicyUpdate};
+use getup_actor::link::{Heartbeat, Lease, PolicyUpdate};
 use getup_actor::metrics::ActorMetrics;
 use getup_learner::device;
 use getup_learner::hub::Hub;
 use getup_learner::run_folder::RunFolder;
 use getup_learner::trainer::{Ending, Trainer};
 use getup_proto::v1;
-use getup_replay::{Sampler, Store};
+use getup_replay::{SampleOptions, Sampler, Store};
 use getup_sim::GetUp;
+use tokio::sync::watch;
 
 use super::open_store;
 use super::progress::Progress;
@@ -32,9 +33,42 @@ pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bo
     let store = open_store(config, role, folder)?;
     let (hub, incarnation) = make_hub(config, role, folder)?;
     let trainer = make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, resume)?;
-    let bar = Progress::start(role, config, Arc::clone(&hub), Arc::clone(&store));
-    let mut turns = Turns::new(config, role, folder, hub, store, trainer, incarnation)?;
-    let ending = turns.run(role)?;
+    let bar = Progress::start(role, config, Arc::clone(&hub));
+    // The writer's id is part of every random draw of the lanes: here it is the number of the start.
+    let identity = Identity { writer: incarnation, ..Identity::new(&config.actor.name, config.seed) };
+    let setup = crate::actor::setup(config, identity, folder.root().join("diverged"))?;
+    let options = sample_options(config, incarnation);
+    store.check_options(&options)?;
+    let policies = hub.subscribe(&setup.spec)?;
+    let policy = Arc::new(PolicyUpdate::parse(v1::PolicyUpdate::clone(&policies.borrow()))?);
+    let settings = LaneSettings {
+        task: Arc::new(GetUp::new(&setup.task, config.control_limit())?),
+        config: setup.config,
+        spec: setup.spec,
+        identity: setup.identity,
+        beta: setup.beta,
+        diverged_folder: setup.diverged_folder,
+        metrics: ActorMetrics::new(&role.registry),
+    };
+    let mut turns = Turns {
+        evaluator: Evaluator::new(&config.task, config.control_limit(), config.evaluation.episodes)?,
+        lanes: LaneGroup::new(settings, 0, config.actor.lanes, policy)?,
+        sampler: Sampler::uniform(options.seed),
+        name: config.actor.name.clone(),
+        sequence: 0,
+        options,
+        policies,
+        hub,
+        store,
+        trainer,
+    };
+    while turns.trainer.ending().is_none() && !role.shutdown.is_triggered() {
+        turns.play()?;
+        turns.update(role)?;
+        turns.evaluate()?;
+        turns.take_policy()?;
+    }
+    let ending = turns.trainer.finish()?;
     tokio::runtime::Handle::current().block_on(bar.finish());
     Ok(ending)
 }
@@ -43,11 +77,60 @@ pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bo
 struct Turns {
     name: String,
     hub: Arc<Hub>,
+    policies: watch::Receiver<Arc<v1::PolicyUpdate>>,
     store: Arc<Store>,
     sampler: Sampler,
+    options: SampleOptions,
     trainer: Trainer,
     lanes: LaneGroup,
     evaluator: Evaluator,
+    /// Of the last segment.
     sequence: u64,
-    options: getup_replay::SampleOptions,
+}
+
+impl Turns {
+    /// A control step of every lane.
+    fn play(&mut self) -> Result<()> {
+        let mut segments = Vec::new();
+        self.lanes.step(&mut segments);
+        for segment in &mut segments {
+            self.sequence += 1;
+            segment.sequence = self.sequence;
+        }
+        Ok(self.store.append(segments)?)
+    }
+
+    /// As many updates as the limiter lets through.
+    fn update(&mut self, role: &Role) -> Result<()> {
+        while self.trainer.ending().is_none() && !role.shutdown.is_triggered() {
+            match self.store.try_sample(&mut self.sampler, &self.options)? {
+                Some(minibatch) => self.trainer.tick(&minibatch)?,
+                None => break,
+            }
+        }
+        Ok(())
+    }
+
+    /// Every evaluation that is offered, at once.
+    fn evaluate(&mut self) -> Result<()> {
+        loop {
+            let beat = Heartbeat { actor: self.name.clone(), ..Heartbeat::default() };
+            let reply = self.hub.heartbeat(beat.into(), Instant::now())?;
+            let Some(lease) = reply.lease.map(Lease::parse).transpose()? else { return Ok(()) };
+            let on = |_| ControlFlow::Continue(());
+            let episodes = self.evaluator.evaluate(&lease.update.policy, lease.update.beta, &lease.seeds, on)?;
+            let episodes = episodes.iter().map(|episode| episode.result().into()).collect();
+            self.hub.report(v1::EvaluationReport { lease: lease.id, actor: self.name.clone(), episodes })?;
+            self.trainer.take_reports()?;
+        }
+    }
+
+    /// The newest policy into the lanes.
+    fn take_policy(&mut self) -> Result<()> {
+        if self.policies.has_changed()? {
+            let policy = v1::PolicyUpdate::clone(&self.policies.borrow_and_update());
+            self.lanes.set_policy(Arc::new(PolicyUpdate::parse(policy)?))?;
+        }
+        Ok(())
+    }
 }

@@ -26,7 +26,7 @@ mod writers;
 pub(crate) use record::State;
 pub(crate) use watermark::Watermark;
 
-use crate::config::{ReplayConfig, Sync};
+use crate::config::{ReplayConfig, SyncMode};
 use crate::error::StoreError;
 use getup_proto::{RunSpec, Segment};
 use manifest::Manifest;
@@ -102,7 +102,7 @@ impl Log {
             None => create(dir, spec)?,
         };
         let acknowledged = watermark.acknowledged()?;
-        let opened = caught(|| {
+        let opened = caught(|| -> Result<_, StoreError> {
             let db = open_sled(dir)?;
             let recovered = Recovered::read(dir, &db, spec, acknowledged, replay)?;
             Ok((db, recovered))
@@ -110,8 +110,8 @@ impl Log {
         let (db, recovered) = opened
             .map_err(|panic| StoreError::damaged(dir, format!("its log is inconsistent ({panic})")))??;
         let fsync = match config.sync {
-            Sync::Process => None,
-            Sync::Data => {
+            SyncMode::Process => None,
+            SyncMode::Data => {
                 let path = dir.join(SLED).join("db");
                 Some(File::open(&path).map_err(StoreError::io("open", path))?)
             }

@@ -101,7 +101,7 @@ fn another_run_another_format_and_a_second_process_are_refused_with_the_way_out(
     let mut other = spec.clone();
     other.run = "other".to_owned();
     let refused = open(dir.path(), &other, 256).unwrap_err().to_string();
-    assert!(refused.contains("another run") && refused.contains("the run is `test`"), "{refused}");
+    assert!(refused.contains("cannot be used here") && refused.contains("the run is `test`"), "{refused}");
 
     let manifest = dir.path().join("store.json");
     let text = fs::read_to_string(&manifest).unwrap().replace("\"format\": 1", "\"format\": 7");
@@ -112,7 +112,7 @@ fn another_run_another_format_and_a_second_process_are_refused_with_the_way_out(
 
 #[test]
 fn a_missing_or_damaged_small_file_is_named() {
-    let spec = fixtures::spec(8);
+    let spec = fixtures::spec(64);
     for (file, content) in [
         ("store.json", Some("{\"format\": 1")),
         ("store.json", Some("{}")),
@@ -121,7 +121,7 @@ fn a_missing_or_damaged_small_file_is_named() {
         ("watermark", None),
     ] {
         let dir = TempDir::new().unwrap();
-        written(dir.path(), &fixtures::spec(64), 3);
+        written(dir.path(), &spec, 3);
         match content {
             Some(content) => fs::write(dir.path().join(file), content).unwrap(),
             None => fs::remove_file(dir.path().join(file)).unwrap(),

@@ -72,8 +72,9 @@ impl Watermark {
 
     fn write(&self, at: u64, number: u64) -> Result<(), StoreError> {
         let mut record = [0; RECORD_BYTES];
-        record[..8].copy_from_slice(&number.to_le_bytes());
-        record[8..].copy_from_slice(&crc32fast::hash(&record[..8]).to_le_bytes());
+        let number = number.to_le_bytes();
+        record[..8].copy_from_slice(&number);
+        record[8..].copy_from_slice(&crc32fast::hash(&number).to_le_bytes());
         self.file.write_all_at(&record, at).map_err(StoreError::io("write", &self.path))
     }
 

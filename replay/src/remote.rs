@@ -1,0 +1,320 @@
+//! Sampling a replay service: [`RemoteSource`], and [`describe`].
+
+use crate::minibatch::{Minibatch, SampleOptions};
+use crate::source::{MinibatchSource, SampleError};
+use getup_proto::v1::replay_client::ReplayClient;
+use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, v1};
+use getup_telemetry::{Backoff, Shutdown, Waits};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+use tokio::runtime::Handle;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Code, Status};
+
+/// How often a wait looks whether it was cancelled.
+const CANCEL_TICK: Duration = Duration::from_millis(50);
+/// How often a wait's reason is brought up to date.
+const REASON_TICK: Duration = Duration::from_secs(1);
+/// How long a connection or a short call may take.
+const CALL_PATIENCE: Duration = Duration::from_secs(5);
+/// A service that does not answer pings for this long is gone.
+const PING_EVERY: Duration = Duration::from_secs(10);
+/// Bytes of a stream that may be on their way to a client that is not reading.
+const STREAM_WINDOW_BYTES: u32 = 8 << 20;
+
+/// Samples a replay service. A task of its own fetches minibatches ahead, and connects again when the service is
+/// gone; the minibatches that are queued meanwhile are still given out.
+#[derive(Debug)]
+pub struct RemoteSource {
+    queue: Receiver<Result<Minibatch, SampleError>>,
+    /// Tells the task that a minibatch was taken from the queue.
+    taken: mpsc::UnboundedSender<()>,
+    /// Why there is none.
+    reason: Reason,
+    waits: Waits,
+    shutdown: Shutdown,
+}
+
+/// What a [`RemoteSource`] asks for, and where.
+#[derive(Clone, Debug)]
+pub struct RemoteOptions {
+    /// Where the service listens, as `host:port`.
+    pub endpoint: String,
+    /// The run's spec: a service with another refuses.
+    pub spec: RunSpec,
+    /// What minibatches are made of.
+    pub sample: SampleOptions,
+    /// Who samples, for logs and `status`.
+    pub name: String,
+    /// Minibatches that are fetched ahead, from 1.
+    pub prefetch: usize,
+}
+
+/// A reason that the task writes and the one who waits reads.
+type Reason = Arc<Mutex<String>>;
+
+impl RemoteSource {
+    /// Starts the task on `runtime`; it ends with the source.
+    pub fn new(options: RemoteOptions, runtime: &Handle, waits: Waits, shutdown: Shutdown) -> Self {
+        let prefetch = options.prefetch.max(1);
+        // One place more, for the error that ends it.
+        let (sender, queue) = sync_channel(prefetch + 1);
+        let (taken, consumed) = mpsc::unbounded_channel();
+        let reason = Reason::default();
+        let fetching = Fetching {
+            options,
+            prefetch,
+            queue: sender,
+            consumed,
+            queued: 0,
+            reason: reason.clone(),
+            streams: 0,
+        };
+        runtime.spawn(fetching.run());
+        Self { queue, taken, reason, waits, shutdown }
+    }
+}
+
+impl MinibatchSource for RemoteSource {
+    fn poll(&mut self, patience: Duration) -> Result<Option<Minibatch>, SampleError> {
+        let started = Instant::now();
+        let mut wait = None;
+        let mut explained = started;
+        loop {
+            if self.shutdown.is_triggered() {
+                return Err(SampleError::Shutdown);
+            }
+            let left = patience.saturating_sub(started.elapsed());
+            match self.queue.recv_timeout(left.min(CANCEL_TICK)) {
+                Ok(minibatch) => {
+                    // The task may just have ended with an error, which is then next in the queue.
+                    let _ = self.taken.send(());
+                    return minibatch.map(Some);
+                }
+                Err(RecvTimeoutError::Disconnected) => return Err(SampleError::Shutdown),
+                Err(RecvTimeoutError::Timeout) if left.is_zero() => return Ok(None),
+                Err(RecvTimeoutError::Timeout) => {}
+            }
+            let reason = || lock(&self.reason).clone();
+            match &wait {
+                None => wait = Some(self.waits.begin("learner", reason())),
+                Some(guard) if explained.elapsed() >= REASON_TICK => {
+                    guard.set_reason(reason());
+                    explained = Instant::now();
+                }
+                Some(_) => {}
+            }
+        }
+    }
+}
+
+/// What the service says of its store.
+///
+/// # Errors
+/// UNAVAILABLE if the service is not there, DEADLINE_EXCEEDED if it does not answer.
+pub async fn describe(endpoint: &str) -> Result<v1::DescribeReply, Status> {
+    let channel = connect(endpoint).await.map_err(|error| Status::unavailable(error.to_string()))?;
+    ask(ReplayClient::new(channel)).await
+}
+
+async fn ask(mut client: ReplayClient<Channel>) -> Result<v1::DescribeReply, Status> {
+    let answer = tokio::time::timeout(CALL_PATIENCE, client.describe(v1::DescribeRequest {})).await;
+    answer.map_err(|_| Status::deadline_exceeded("replay does not answer"))?.map(tonic::Response::into_inner)
+}
+
+async fn connect(endpoint: &str) -> Result<Channel, tonic::transport::Error> {
+    Endpoint::from_shared(format!("http://{endpoint}"))?
+        .connect_timeout(CALL_PATIENCE)
+        .tcp_nodelay(true)
+        .http2_keep_alive_interval(PING_EVERY)
+        .keep_alive_timeout(PING_EVERY)
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(STREAM_WINDOW_BYTES)
+        .connect()
+        .await
+}
+
+/// The task of a [`RemoteSource`].
+struct Fetching {
+    options: RemoteOptions,
+    prefetch: usize,
+    queue: SyncSender<Result<Minibatch, SampleError>>,
+    consumed: mpsc::UnboundedReceiver<()>,
+    /// Minibatches in the queue.
+    queued: usize,
+    reason: Reason,
+    /// Streams opened so far.
+    streams: u64,
+}
+
+/// Why a stream ended.
+enum End {
+    /// The source was dropped.
+    Dropped,
+    /// The service is not there, or went: worth another attempt.
+    Gone(String),
+    /// The service would refuse again.
+    Refused(String),
+}
+
+impl Fetching {
+    async fn run(mut self) {
+        let mut backoff = Backoff::new();
+        loop {
+            self.explain(format!("a connection to replay at {}", self.options.endpoint));
+            match self.stream(&mut backoff).await {
+                End::Dropped => return,
+                End::Gone(why) => {
+                    self.explain(format!("replay at {} is gone ({why})", self.options.endpoint));
+                    tracing::debug!("replay at {} is gone: {why}", self.options.endpoint);
+                    tokio::time::sleep(backoff.next()).await;
+                }
+                End::Refused(reason) => {
+                    let endpoint = self.options.endpoint.clone();
+                    // There is a place for it; a source that was dropped needs it no more.
+                    let _ = self.queue.try_send(Err(SampleError::Refused { endpoint, reason }));
+                    return;
+                }
+            }
+            if self.queue_is_abandoned() {
+                return;
+            }
+        }
+    }
+
+    /// One connection, from hello to its end.
+    async fn stream(&mut self, backoff: &mut Backoff) -> End {
+        let channel = match connect(&self.options.endpoint).await {
+            Ok(channel) => channel,
+            Err(error) => return End::Gone(root_cause(&error)),
+        };
+        let mut client = ReplayClient::new(channel.clone())
+            .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            .max_encoding_message_size(MAX_MESSAGE_BYTES);
+        let (requests, outbound) = mpsc::channel(self.prefetch + 2);
+        let credits = (self.prefetch - self.queued) as u32;
+        for message in [v1::sample_request::Message::Hello(self.hello()), credits_message(credits)] {
+            // The channel has room, and its receiver is here.
+            let _ = requests.try_send(v1::SampleRequest { message: Some(message) });
+        }
+        let mut inbound = match client.sample(ReceiverStream::new(outbound)).await {
+            Ok(response) => response.into_inner(),
+            Err(status) => return End::from(status),
+        };
+        let mut asked_why = tokio::time::interval(REASON_TICK);
+        loop {
+            tokio::select! {
+                message = inbound.message() => match message {
+                    Ok(Some(reply)) => {
+                        backoff.reset();
+                        asked_why.reset();
+                        if let Err(end) = self.enqueue(reply) {
+                            return end;
+                        }
+                    }
+                    Ok(None) => return End::Gone("it ended the stream".to_owned()),
+                    Err(status) => return End::from(status),
+                },
+                taken = self.consumed.recv() => {
+                    if taken.is_none() {
+                        return End::Dropped;
+                    }
+                    self.queued -= 1;
+                    let message = Some(credits_message(1));
+                    if requests.send(v1::SampleRequest { message }).await.is_err() {
+                        return End::Gone("it ended the stream".to_owned());
+                    }
+                },
+                _ = asked_why.tick(), if self.queued == 0 => {
+                    if let Ok(described) = ask(ReplayClient::new(channel.clone())).await {
+                        let waiting = described.limiter.map(|limiter| limiter.waiting).unwrap_or_default();
+                        let default = || format!("minibatches from replay at {}", self.options.endpoint);
+                        self.explain(if waiting.is_empty() { default() } else { waiting });
+                    }
+                },
+            }
+        }
+    }
+
+    fn hello(&mut self) -> v1::SampleHello {
+        let SampleOptions { batch, n_step, gamma, seed } = self.options.sample;
+        self.streams += 1;
+        v1::SampleHello {
+            spec: Some(self.options.spec.to_wire()),
+            batch: batch as u32,
+            n_step: n_step as u32,
+            gamma,
+            // A stream that replaces another must not draw the same again.
+            seed: seed.wrapping_add((self.streams - 1).wrapping_mul(0x9e37_79b9_7f4a_7c15)),
+            name: self.options.name.clone(),
+        }
+    }
+
+    fn enqueue(&mut self, reply: v1::SampleReply) -> Result<(), End> {
+        for minibatch in reply.minibatches {
+            let Some(minibatch) = Minibatch::parse(minibatch, self.options.sample.batch) else {
+                return Err(End::Refused(
+                    "it sends malformed minibatches: are both of one version?".to_owned(),
+                ));
+            };
+            if self.queued == self.prefetch {
+                return Err(End::Refused("it sends more than it was asked for".to_owned()));
+            }
+            if self.queue.try_send(Ok(minibatch)).is_err() {
+                return Err(End::Dropped);
+            }
+            self.queued += 1;
+        }
+        Ok(())
+    }
+
+    /// Counts what was taken while there was no stream; true if nobody will take any more.
+    fn queue_is_abandoned(&mut self) -> bool {
+        loop {
+            match self.consumed.try_recv() {
+                Ok(()) => self.queued -= 1,
+                Err(mpsc::error::TryRecvError::Empty) => return false,
+                Err(mpsc::error::TryRecvError::Disconnected) => return true,
+            }
+        }
+    }
+
+    fn explain(&self, reason: String) {
+        *lock(&self.reason) = reason;
+    }
+}
+
+impl From<Status> for End {
+    fn from(status: Status) -> Self {
+        let reason = status.message().to_owned();
+        match status.code() {
+            Code::InvalidArgument
+            | Code::FailedPrecondition
+            | Code::Unimplemented
+            | Code::Unauthenticated
+            | Code::PermissionDenied
+            | Code::OutOfRange => Self::Refused(reason),
+            _ => Self::Gone(reason),
+        }
+    }
+}
+
+fn credits_message(credits: u32) -> v1::sample_request::Message {
+    v1::sample_request::Message::Credits(credits)
+}
+
+/// The innermost error: "connection refused" says more than "transport error".
+fn root_cause(error: &dyn std::error::Error) -> String {
+    let mut cause = error;
+    while let Some(source) = cause.source() {
+        cause = source;
+    }
+    cause.to_string()
+}
+
+fn lock(reason: &Reason) -> std::sync::MutexGuard<'_, String> {
+    reason.lock().unwrap_or_else(PoisonError::into_inner)
+}

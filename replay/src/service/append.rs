@@ -1,0 +1,151 @@
+//! A writer's stream: segments in, acknowledgements out.
+
+use super::committer::Job;
+use super::{failed, shutting_down};
+use crate::store::Store;
+use getup_proto::{Segment, v1};
+use getup_telemetry::Shutdown;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use tokio::sync::{mpsc, oneshot, watch};
+use tonic::{Status, Streaming};
+
+type Replies = mpsc::Sender<Result<v1::AppendReply, Status>>;
+
+/// A writer that has said hello.
+pub(super) struct AppendStream {
+    visit: Visit,
+    jobs: mpsc::Sender<Job>,
+    /// Durable before this stream.
+    durable: u64,
+}
+
+/// A writer's presence at the store; ends when dropped.
+struct Visit {
+    store: Arc<Store>,
+    writer: u64,
+}
+
+impl Drop for Visit {
+    fn drop(&mut self) {
+        self.store.farewell(self.writer);
+    }
+}
+
+impl AppendStream {
+    /// Introduces the writer.
+    pub(super) async fn new(
+        store: Arc<Store>,
+        jobs: mpsc::Sender<Job>,
+        writer: u64,
+        name: String,
+    ) -> Result<Self, Status> {
+        let (durable, answer) = oneshot::channel();
+        jobs.send(Job::Introduce { writer, name, durable }).await.map_err(|_| failed())?;
+        let durable = answer.await.map_err(|_| failed())?;
+        Ok(Self { visit: Visit { store, writer }, jobs, durable })
+    }
+
+    /// Takes segments until the stream ends, breaks, sends something wrong, or `shutdown`; then acknowledges what
+    /// was taken, and says why there is no more.
+    pub(super) async fn run(
+        self,
+        inbound: Streaming<v1::AppendRequest>,
+        replies: Replies,
+        shutdown: Shutdown,
+    ) {
+        if acknowledge(&replies, self.durable).await.is_none() {
+            return;
+        }
+        let taken = AtomicU64::new(self.durable);
+        let (durable, mut progress) = watch::channel(self.durable);
+        let end = {
+            let reading = self.read(inbound, &taken, durable);
+            tokio::pin!(reading);
+            loop {
+                tokio::select! {
+                    end = &mut reading => break end,
+                    () = shutdown.wait() => break Err(shutting_down()),
+                    // With `reading`, a sender of it lives.
+                    Ok(()) = progress.changed() => {
+                        let sequence = *progress.borrow_and_update();
+                        if acknowledge(&replies, sequence).await.is_none() {
+                            return;
+                        }
+                    }
+                }
+            }
+        };
+        // An error here means that the committer gave up, and the store with it.
+        let taken = taken.into_inner();
+        let durable = progress.wait_for(|sequence| *sequence >= taken).await.map(|sequence| *sequence);
+        let end = match durable {
+            Ok(sequence) => acknowledge(&replies, sequence).await.map_or(Ok(()), |()| end),
+            Err(_) => Err(failed()),
+        };
+        if let Err(status) = end {
+            // Where the client has gone there is nobody to tell.
+            let _ = replies.send(Err(status)).await;
+        }
+    }
+
+    /// Passes segments on to the committer, at the limiter's pace. `taken` is the newest that was.
+    async fn read(
+        &self,
+        mut inbound: Streaming<v1::AppendRequest>,
+        taken: &AtomicU64,
+        durable: watch::Sender<u64>,
+    ) -> Result<(), Status> {
+        let mut newest = 0;
+        while let Some(request) = inbound.message().await? {
+            let segment = self.parse(request, newest)?;
+            newest = segment.sequence;
+            let store = &self.visit.store;
+            store.gate().heard_writer(self.visit.writer);
+            if segment.sequence <= self.durable {
+                continue;
+            }
+            let permit = store.gate().admit_task(u64::from(segment.env_steps)).await;
+            let job = Job::Append { segment, permit, durable: durable.clone() };
+            self.jobs.send(job).await.map_err(|_| failed())?;
+            taken.store(newest, Ordering::Relaxed);
+        }
+        Ok(())
+    }
+
+    /// The segment of a request; `newest` is the sequence number before it on this stream.
+    fn parse(&self, request: v1::AppendRequest, newest: u64) -> Result<Segment, Status> {
+        let metrics = self.visit.store.metrics();
+        let refused = |reason: &str, text: String| {
+            metrics.reject(reason);
+            Status::invalid_argument(text)
+        };
+        let Some(v1::append_request::Message::Segment(segment)) = request.message else {
+            return Err(refused(
+                "hello",
+                "a stream has one hello, and then segments: send a segment".to_owned(),
+            ));
+        };
+        let segment = Segment::parse(segment, self.visit.store.spec())
+            .map_err(|error| refused(error.kind(), error.to_string()))?;
+        if segment.writer != self.visit.writer {
+            let (theirs, ours) = (segment.writer, self.visit.writer);
+            let text =
+                format!("a segment of writer {theirs} came on the stream of writer {ours}: open another");
+            return Err(refused("writer", text));
+        }
+        if segment.sequence <= newest {
+            let text = format!(
+                "segment {} came after segment {newest}: a writer's sequence numbers increase",
+                segment.sequence
+            );
+            return Err(refused("sequence", text));
+        }
+        Ok(segment)
+    }
+}
+
+/// Tells the client; None if it has gone.
+async fn acknowledge(replies: &Replies, durable_sequence: u64) -> Option<()> {
+    replies.send(Ok(v1::AppendReply { durable_sequence })).await.ok()
+}

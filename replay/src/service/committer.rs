@@ -1,0 +1,61 @@
+//! The one thread that appends: it takes what the streams have queued and commits it together.
+//!
+//! While the disk takes one group, the next gathers in the queue: the busier the service, the larger its commits.
+
+use crate::error::StoreError;
+use crate::gate::Permit;
+use crate::store::Store;
+use getup_proto::{RunSpec, Segment};
+use tokio::sync::{mpsc, oneshot, watch};
+
+/// Segments of a commit, and of the queue, at most.
+const MOST_SEGMENTS: usize = 128;
+/// Their bytes, at most (and never less than one segment).
+const MOST_BYTES: usize = 32 << 20;
+
+/// What a stream asks for.
+pub(super) enum Job {
+    /// Says how far the writer's segments are durable.
+    Introduce { writer: u64, name: String, durable: oneshot::Sender<u64> },
+    /// Appends a segment, and raises `durable` to its sequence number.
+    Append { segment: Segment, permit: Permit, durable: watch::Sender<u64> },
+}
+
+/// How many jobs may be queued.
+pub(super) fn queue_length(spec: &RunSpec) -> usize {
+    let longest: usize = spec.columns.iter().map(|column| column.bytes(spec.max_segment_steps)).sum();
+    (MOST_BYTES / longest).clamp(1, MOST_SEGMENTS)
+}
+
+/// Works until all senders of the queue are gone, or an append fails.
+pub(super) fn run(store: &Store, mut queue: mpsc::Receiver<Job>) -> Result<(), StoreError> {
+    let most = queue_length(store.spec());
+    let mut jobs = Vec::with_capacity(most);
+    while queue.blocking_recv_many(&mut jobs, most) > 0 {
+        let mut segments = Vec::with_capacity(jobs.len());
+        let mut acknowledgements = Vec::with_capacity(jobs.len());
+        for job in jobs.drain(..) {
+            match job {
+                Job::Introduce { writer, name, durable } => {
+                    if durable.send(store.introduce(writer, &name)).is_err() {
+                        store.farewell(writer);
+                    }
+                }
+                Job::Append { segment, permit, durable } => {
+                    acknowledgements.push((segment.sequence, permit, durable));
+                    segments.push(segment);
+                }
+            }
+        }
+        store.append_checked(segments)?;
+        for (sequence, permit, durable) in acknowledgements {
+            drop(permit);
+            durable.send_if_modified(|newest| {
+                let newer = sequence > *newest;
+                *newest = sequence.max(*newest);
+                newer
+            });
+        }
+    }
+    Ok(())
+}

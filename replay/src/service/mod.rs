@@ -1,0 +1,192 @@
+//! The gRPC service around a store: [`serve`].
+//!
+//! - [`append`]: a writer's stream
+//! - [`sample`]: a sampler's stream
+//! - [`committer`]: the one thread that appends, for all streams together
+
+mod append;
+mod committer;
+mod sample;
+
+use crate::error::StoreError;
+use crate::metrics::ReplayMetrics;
+use crate::store::Store;
+use append::AppendStream;
+use committer::Job;
+use getup_proto::v1::replay_server::{Replay, ReplayServer};
+use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, SpecError, v1};
+use getup_telemetry::Shutdown;
+use getup_telemetry::health::{ServingStatus, health};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::net::TcpListener;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::server::TcpIncoming;
+use tonic::{Request, Response, Status, Streaming};
+
+/// How long streams may take to end after the shutdown has begun.
+const GRACE: Duration = Duration::from_secs(5);
+/// How long a client may take to say hello.
+const HELLO_PATIENCE: Duration = Duration::from_secs(10);
+/// A peer that does not answer pings for this long is gone.
+const PING_EVERY: Duration = Duration::from_secs(10);
+/// Bytes of a stream that may be on their way to a server that is not reading: some tens of segments.
+const STREAM_WINDOW_BYTES: u32 = 1 << 20;
+/// Replies that may wait for a client that is not reading.
+const REPLIES: usize = 2;
+
+/// Why the service ended other than by shutdown.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// The store takes no more segments.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The network refuses.
+    #[error("the replay service cannot go on: {0}")]
+    Transport(#[from] tonic::transport::Error),
+    /// A thread of the service panicked.
+    #[error("the replay service broke: {0}")]
+    Panicked(#[from] tokio::task::JoinError),
+}
+
+/// Serves the store and the gRPC health service until `shutdown`: then takes no more segments, acknowledges those
+/// that came, ends all streams with UNAVAILABLE, and returns.
+///
+/// # Errors
+/// [`ServeError`], when the store or the network fails.
+pub async fn serve(listener: TcpListener, store: Arc<Store>, shutdown: Shutdown) -> Result<(), ServeError> {
+    let (jobs, queue) = mpsc::channel(committer::queue_length(store.spec()));
+    let committing = {
+        let store = store.clone();
+        tokio::task::spawn_blocking(move || committer::run(&store, queue))
+    };
+    let (reporter, health) = health();
+    let service = ReplayServer::new(Service { store, jobs, shutdown: shutdown.clone() })
+        .max_decoding_message_size(MAX_MESSAGE_BYTES)
+        .max_encoding_message_size(MAX_MESSAGE_BYTES);
+    let drain = {
+        let shutdown = shutdown.clone();
+        async move {
+            shutdown.wait().await;
+            reporter.set_service_status("", ServingStatus::NotServing).await;
+        }
+    };
+    let serving = tonic::transport::Server::builder()
+        .http2_keepalive_interval(Some(PING_EVERY))
+        .http2_keepalive_timeout(Some(PING_EVERY))
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(4 * STREAM_WINDOW_BYTES)
+        .add_service(health)
+        .add_service(service)
+        .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), drain);
+    let out_of_patience = async {
+        shutdown.wait().await;
+        tokio::time::sleep(GRACE).await;
+    };
+    tokio::pin!(committing);
+    tokio::select! {
+        served = serving => served?,
+        committed = &mut committing => return Ok(committed??),
+        () = out_of_patience => tracing::warn!("replay ends with streams open: their clients did not let go"),
+    }
+    // With the service its end of the queue is gone: the committer ends once it has worked it off.
+    match tokio::time::timeout(GRACE, committing).await {
+        Ok(committed) => Ok(committed??),
+        Err(_) => {
+            tracing::warn!("replay ends while the disk still takes a commit");
+            Ok(())
+        }
+    }
+}
+
+/// What all streams share.
+struct Service {
+    store: Arc<Store>,
+    jobs: mpsc::Sender<Job>,
+    shutdown: Shutdown,
+}
+
+#[tonic::async_trait]
+impl Replay for Service {
+    type AppendStream = ReceiverStream<Result<v1::AppendReply, Status>>;
+    type SampleStream = ReceiverStream<Result<v1::SampleReply, Status>>;
+
+    async fn append(
+        &self,
+        request: Request<Streaming<v1::AppendRequest>>,
+    ) -> Result<Response<Self::AppendStream>, Status> {
+        let mut inbound = request.into_inner();
+        let first = first_message(&mut inbound).await.and_then(|message| match message.message {
+            Some(v1::append_request::Message::Hello(hello)) => Ok(hello),
+            _ => Err(no_hello()),
+        });
+        let metrics = self.store.metrics();
+        let hello = first.inspect_err(|_| metrics.reject("hello"))?;
+        check_spec(self.store.spec(), hello.spec, metrics)?;
+        let name = named(hello.name, || format!("writer {}", hello.writer));
+        let (replies, outbound) = mpsc::channel(REPLIES);
+        let stream = AppendStream::new(self.store.clone(), self.jobs.clone(), hello.writer, name).await?;
+        tokio::spawn(stream.run(inbound, replies, self.shutdown.clone()));
+        Ok(Response::new(ReceiverStream::new(outbound)))
+    }
+
+    async fn sample(
+        &self,
+        request: Request<Streaming<v1::SampleRequest>>,
+    ) -> Result<Response<Self::SampleStream>, Status> {
+        let mut inbound = request.into_inner();
+        let first = first_message(&mut inbound).await.and_then(|message| match message.message {
+            Some(v1::sample_request::Message::Hello(hello)) => Ok(hello),
+            _ => Err(no_hello()),
+        });
+        let metrics = self.store.metrics();
+        let mut hello = first.inspect_err(|_| metrics.reject("hello"))?;
+        check_spec(self.store.spec(), hello.spec.take(), metrics)?;
+        let source = sample::source(&self.store, hello, self.shutdown.clone())
+            .inspect_err(|_| metrics.reject("options"))?;
+        let (replies, outbound) = mpsc::channel(REPLIES);
+        sample::start(source, inbound, replies, self.shutdown.clone());
+        Ok(Response::new(ReceiverStream::new(outbound)))
+    }
+
+    async fn describe(&self, _: Request<v1::DescribeRequest>) -> Result<Response<v1::DescribeReply>, Status> {
+        let store = self.store.clone();
+        let described = tokio::task::spawn_blocking(move || store.describe()).await;
+        described.map(Response::new).map_err(|error| Status::internal(error.to_string()))
+    }
+}
+
+async fn first_message<T>(inbound: &mut Streaming<T>) -> Result<T, Status> {
+    match tokio::time::timeout(HELLO_PATIENCE, inbound.message()).await {
+        Ok(message) => message?.ok_or_else(no_hello),
+        Err(_) => Err(no_hello()),
+    }
+}
+
+fn no_hello() -> Status {
+    Status::invalid_argument("the first message of a stream must be its hello: send it first")
+}
+
+fn check_spec(ours: &RunSpec, theirs: Option<v1::RunSpec>, metrics: &ReplayMetrics) -> Result<(), Status> {
+    let parsed = theirs.ok_or(SpecError::Missing).and_then(RunSpec::parse);
+    let status = match parsed.map(|theirs| ours.check_same(&theirs)) {
+        Ok(Ok(())) => return Ok(()),
+        Ok(Err(differs)) => Status::failed_precondition(differs.to_string()),
+        Err(malformed) => Status::invalid_argument(malformed.to_string()),
+    };
+    metrics.reject("spec");
+    Err(status)
+}
+
+fn named(name: String, otherwise: impl FnOnce() -> String) -> String {
+    if name.is_empty() { otherwise() } else { name }
+}
+
+fn failed() -> Status {
+    Status::unavailable("the replay store has failed: see its log")
+}
+
+fn shutting_down() -> Status {
+    Status::unavailable("replay is shutting down: connect again when it is back")
+}

@@ -1,0 +1,131 @@
+//! kill -9 under load: every acknowledged segment is there, and none twice.
+
+mod common;
+mod fixtures;
+
+use common::{PATIENCE, Writer, config, open};
+use fixtures::{segment, spec};
+use getup_replay::{MinibatchSource, RemoteOptions, RemoteSource, serve};
+use getup_telemetry::{Registry, Shutdown, Waits};
+use std::collections::HashMap;
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+use tempfile::TempDir;
+use tokio::net::TcpListener;
+
+const DIR: &str = "GETUP_TEST_REPLAY_DIR";
+const WRITERS: u64 = 3;
+const STEPS: usize = 8;
+
+/// The process that is killed: without its variable there is nothing to prove here.
+#[test]
+fn serves_until_it_is_killed() {
+    let Some(dir) = std::env::var_os(DIR) else { return };
+    let store = open(Path::new(&dir), &spec(STEPS), &config()).unwrap();
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    runtime.block_on(async {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        println!("\nlistening on {}", listener.local_addr().unwrap());
+        serve(listener, Arc::new(store), Shutdown::new()).await.unwrap();
+    });
+}
+
+fn start(dir: &Path) -> (Child, String) {
+    let mut child = Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "serves_until_it_is_killed", "--nocapture"])
+        .env(DIR, dir)
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let endpoint =
+        lines.map_while(Result::ok).find_map(|line| line.strip_prefix("listening on ").map(str::to_owned));
+    (child, endpoint.expect("the process says where it listens"))
+}
+
+/// Writes segments from somewhat before the service's mark until the service is gone; returns what was acknowledged.
+async fn write(endpoint: String, id: u64, acknowledged: Arc<AtomicU64>) {
+    let spec = spec(STEPS);
+    let Ok(mut writer) = Writer::connect(&endpoint, &spec, id).await else { return };
+    assert!(writer.durable >= acknowledged.load(Ordering::SeqCst), "an acknowledged segment is gone");
+    let from = writer.durable.saturating_sub(5) + 1;
+    let (requests, mut replies) = (writer.requests.clone(), writer.replies);
+    let sending = tokio::spawn(async move {
+        for sequence in from.. {
+            let message = Some(common::message(&segment(&spec, id, sequence, STEPS)));
+            if requests.send(getup_proto::v1::AppendRequest { message }).await.is_err() {
+                return;
+            }
+        }
+    });
+    writer.requests = tokio::sync::mpsc::channel(1).0;
+    while let Ok(sequence) = common::next(&mut replies).await {
+        acknowledged.fetch_max(sequence, Ordering::SeqCst);
+    }
+    sending.abort();
+}
+
+#[test]
+fn every_acknowledged_segment_survives_a_kill_under_load_and_none_is_stored_twice() {
+    let kills = if std::env::var_os("GETUP_TEST_FULL").is_some() { 200 } else { 4 };
+    let dir = TempDir::new().unwrap();
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let acknowledged: HashMap<u64, Arc<AtomicU64>> = (1..=WRITERS).map(|id| (id, Arc::default())).collect();
+    let total = || acknowledged.values().map(|sequence| sequence.load(Ordering::SeqCst)).sum::<u64>();
+    let mut sampled = 0;
+    for kill in 0..kills {
+        let (mut child, endpoint) = start(dir.path());
+        let before = total();
+        let writing: Vec<_> = acknowledged
+            .iter()
+            .map(|(&id, acknowledged)| runtime.spawn(write(endpoint.clone(), id, acknowledged.clone())))
+            .collect();
+        let mut source = sampler(&endpoint, &runtime);
+        // At another moment each time, and not before something was acknowledged.
+        let started = Instant::now();
+        let lasts = Duration::from_millis(30 + 37 * (kill % 7));
+        while started.elapsed() < lasts || total() <= before {
+            assert!(started.elapsed() < PATIENCE, "nothing is acknowledged");
+            if let Some(minibatch) = source.poll(Duration::from_millis(5)).unwrap() {
+                sampled = minibatch.counters.sampled;
+            }
+        }
+        child.kill().unwrap();
+        child.wait().unwrap();
+        for writing in writing {
+            runtime.block_on(writing).unwrap();
+        }
+
+        let store = open(dir.path(), &spec(STEPS), &config()).unwrap();
+        let mut stored = 0;
+        for (&id, acknowledged) in &acknowledged {
+            let durable = store.introduce(id, "actor");
+            assert!(
+                durable >= acknowledged.load(Ordering::SeqCst),
+                "kill {kill}: an acknowledged segment is gone"
+            );
+            stored += durable * STEPS as u64;
+        }
+        // Writers leave no gaps here: so many segments, each once, and as many of them as fit.
+        let counters = store.counters();
+        assert_eq!(counters.transitions, stored, "kill {kill}");
+        assert_eq!(store.len() as u64, stored.min(config().capacity as u64), "kill {kill}");
+        assert!(counters.sampled >= sampled, "kill {kill}: samples were forgotten");
+    }
+    assert!(total() > kills);
+}
+
+fn sampler(endpoint: &str, runtime: &tokio::runtime::Runtime) -> RemoteSource {
+    let options = RemoteOptions {
+        endpoint: endpoint.to_owned(),
+        spec: spec(STEPS),
+        sample: common::options(32),
+        name: "learner".to_owned(),
+        prefetch: 2,
+    };
+    RemoteSource::new(options, runtime.handle(), Waits::new(&Registry::new()), Shutdown::new())
+}

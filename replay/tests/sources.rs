@@ -1,0 +1,205 @@
+//! One suite of assertions for both ways to sample: in the same process, and over gRPC.
+
+mod common;
+mod fixtures;
+
+use common::{Replay, config, eventually, options};
+use fixtures::{Ending, Part, segment, spec, value};
+use getup_replay::{
+    LocalSource, MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, SampleError, SampleOptions,
+};
+use std::time::{Duration, Instant};
+
+/// How to get a source from a replay.
+type Connect = fn(&Replay, SampleOptions) -> Result<Box<dyn MinibatchSource>, SampleError>;
+
+fn local(replay: &Replay, options: SampleOptions) -> Result<Box<dyn MinibatchSource>, SampleError> {
+    let source = LocalSource::new(replay.store.clone(), options, "learner", replay.shutdown.clone())?;
+    Ok(Box::new(source))
+}
+
+fn remote(replay: &Replay, sample: SampleOptions) -> Result<Box<dyn MinibatchSource>, SampleError> {
+    let options = RemoteOptions {
+        endpoint: replay.endpoint.clone(),
+        spec: replay.spec.clone(),
+        sample,
+        name: "learner".to_owned(),
+        prefetch: 4,
+    };
+    let runtime = replay.runtime.handle();
+    let source = RemoteSource::new(options, runtime, replay.waits.clone(), replay.shutdown.clone());
+    Ok(Box::new(source))
+}
+
+macro_rules! both_sources {
+    ($($name:ident)*) => {
+        mod in_process { $(#[test] fn $name() { super::$name(super::local) })* }
+        mod over_grpc { $(#[test] fn $name() { super::$name(super::remote) })* }
+    };
+}
+
+both_sources! {
+    minibatches_hold_whole_transitions_of_what_was_appended
+    n_step_returns_span_segments
+    counters_come_with_every_minibatch
+    the_first_sample_waits_for_the_minimum_and_says_why
+    sampling_waits_for_inserts_and_stays_in_the_band
+    options_out_of_range_are_refused
+    shutdown_ends_a_wait
+}
+
+fn minibatches_hold_whole_transitions_of_what_was_appended(connect: Connect) {
+    let replay = Replay::start(spec(8), &config());
+    let segments = (1..=20).map(|i| segment(&replay.spec, 1, i, 8)).collect();
+    replay.store.append(segments).unwrap();
+    let mut source = connect(&replay, options(32)).unwrap();
+    for _ in 0..20 {
+        let minibatch = source.next().unwrap();
+        let names: Vec<_> =
+            minibatch.columns.iter().map(|column| (column.name.as_str(), column.width)).collect();
+        let expected = [
+            ("observation", 3),
+            ("action", 2),
+            ("reward", 1),
+            ("beta", 1),
+            ("next_observation", 3),
+            ("discount", 1),
+        ];
+        assert_eq!(names, expected);
+        let data = |name: &str| &minibatch.column(name).unwrap().data;
+        for i in 0..32 {
+            let is_here = |&(episode, step): &(u64, usize)| {
+                data("observation")[3 * i] == value(1, 0, episode, step, 0, 0)
+                    && data("action")[2 * i + 1] == value(1, 0, episode, step, 1, 1)
+                    && data("reward")[i] == value(1, 0, episode, step, 2, 0)
+                    && data("beta")[i] == value(1, 0, episode, 0, 3, 0)
+                    && data("next_observation")[3 * i + 2] == value(1, 0, episode, step + 1, 0, 2)
+                    && data("discount")[i] == 0.99
+            };
+            let all = (1..=20).flat_map(|episode| (0..8).map(move |step| (episode, step)));
+            assert_eq!(all.filter(is_here).count(), 1);
+        }
+    }
+}
+
+fn n_step_returns_span_segments(connect: Connect) {
+    let replay = Replay::start(spec(4), &config());
+    let part = |sequence, first_step, ending| Part {
+        writer: 1,
+        sequence,
+        lane: 0,
+        episode: 0,
+        first_step,
+        steps: 4,
+        ending,
+    };
+    for (sequence, first_step, ending) in
+        [(1, 0, Ending::None), (2, 4, Ending::None), (3, 8, Ending::Terminal)]
+    {
+        replay.store.append(vec![part(sequence, first_step, ending).build(&replay.spec)]).unwrap();
+    }
+    let mut source = connect(&replay, SampleOptions { n_step: 5, gamma: 0.5, ..options(64) }).unwrap();
+    let minibatch = source.next().unwrap();
+    let data = |name: &str| &minibatch.column(name).unwrap().data;
+    for i in 0..64 {
+        let step = (0..12).find(|&t| data("observation")[3 * i] == value(1, 0, 0, t, 0, 0)).unwrap();
+        let end = (step + 5).min(12);
+        let reward: f32 = (step..end).map(|t| 0.5f32.powi((t - step) as i32) * value(1, 0, 0, t, 2, 0)).sum();
+        assert!((data("reward")[i] - reward).abs() < 1e-6);
+        assert_eq!(data("discount")[i], if end == 12 { 0.0 } else { 0.5f32.powi(5) });
+        assert_eq!(data("next_observation")[3 * i], value(1, 0, 0, end, 0, 0));
+    }
+}
+
+fn counters_come_with_every_minibatch(connect: Connect) {
+    let replay = Replay::start(spec(8), &config());
+    let mut limp = segment(&replay.spec, 1, 1, 8);
+    limp.env_steps = 3;
+    replay.store.append(vec![limp]).unwrap();
+    let mut source = connect(&replay, options(16)).unwrap();
+    for round in 1..=10 {
+        let counters = source.next().unwrap().counters;
+        assert_eq!((counters.env_steps, counters.transitions, counters.episodes), (3, 8, 0));
+        assert_eq!((counters.store, counters.sampled), (replay.store.counters().store, round * 16));
+    }
+}
+
+fn the_first_sample_waits_for_the_minimum_and_says_why(connect: Connect) {
+    let replay = Replay::start(spec(8), &ReplayConfig { min_size: 1000, ..config() });
+    replay.store.introduce(1, "actor-3");
+    let waiting = {
+        let mut source = connect(&replay, options(16)).unwrap();
+        std::thread::spawn(move || source.next())
+    };
+    for sequence in 1..=100 {
+        replay.store.append(vec![segment(&replay.spec, 1, sequence, 8)]).unwrap();
+    }
+    let mut seen = Vec::new();
+    eventually("the wait names the minimum and who is silent", || {
+        seen = replay.waits.current().into_iter().map(|wait| wait.to_string()).collect();
+        seen.iter().any(|text| text.contains("800 of 1,000 transitions; actor-3 silent for "))
+    });
+    assert!(!waiting.is_finished());
+    for sequence in 101..=125 {
+        replay.store.append(vec![segment(&replay.spec, 1, sequence, 8)]).unwrap();
+    }
+    let minibatch = waiting.join().unwrap().unwrap();
+    assert_eq!(minibatch.counters.env_steps, 1000);
+    eventually("nobody waits", || replay.waits.current().is_empty());
+}
+
+fn sampling_waits_for_inserts_and_stays_in_the_band(connect: Connect) {
+    let paced =
+        ReplayConfig { min_size: 16, samples_per_insert: Some(2.0), error_buffer: Some(32.0), ..config() };
+    let replay = Replay::start(spec(8), &paced);
+    let mut source = connect(&replay, options(8)).unwrap();
+    let (mut taken, mut sequence) = (0, 0);
+    for _ in 0..40 {
+        while replay.store.can_insert(4) {
+            sequence += 1;
+            replay.store.append(vec![segment(&replay.spec, 1, sequence, 4)]).unwrap();
+        }
+        while source.poll(Duration::from_millis(100)).unwrap().is_some() {
+            taken += 8;
+            let counters = replay.store.counters();
+            let cursor = counters.env_steps as f64 * 2.0 - counters.sampled as f64;
+            assert!((0.0..=64.0).contains(&cursor), "{counters:?}");
+            if replay.store.can_insert(4) && taken % 64 == 0 {
+                break;
+            }
+        }
+    }
+    let counters = replay.store.counters();
+    assert!(counters.env_steps > 100, "{counters:?}");
+    let ratio = counters.sampled as f64 / counters.env_steps as f64;
+    assert!((1.6..=2.1).contains(&ratio), "{ratio}");
+}
+
+fn options_out_of_range_are_refused(connect: Connect) {
+    let paced =
+        ReplayConfig { min_size: 16, samples_per_insert: Some(2.0), error_buffer: Some(32.0), ..config() };
+    let replay = Replay::start(spec(8), &paced);
+    let refused = |options| {
+        let outcome = connect(&replay, options).and_then(|mut source| source.next());
+        outcome.expect_err("the options are out of range").to_string()
+    };
+    assert!(refused(options(0)).contains("a batch of 0"));
+    assert!(refused(options(33)).contains("raise it to the batch"));
+    assert!(refused(options(1 << 30)).contains("a message holds it"));
+    assert!(refused(SampleOptions { n_step: 0, ..options(8) }).contains("n_step is 0"));
+    assert!(refused(SampleOptions { gamma: 1.5, ..options(8) }).contains("gamma is 1.5"));
+    assert!(refused(SampleOptions { gamma: f32::NAN, ..options(8) }).contains("gamma is NaN"));
+}
+
+fn shutdown_ends_a_wait(connect: Connect) {
+    let replay = Replay::start(spec(8), &config());
+    let mut source = connect(&replay, options(8)).unwrap();
+    assert!(source.poll(Duration::from_millis(50)).unwrap().is_none());
+    let waiting = std::thread::spawn(move || source.next());
+    std::thread::sleep(Duration::from_millis(50));
+    let started = Instant::now();
+    let (result, _) = replay.stop();
+    result.unwrap();
+    assert!(matches!(waiting.join().unwrap(), Err(SampleError::Shutdown)));
+    assert!(started.elapsed() < Duration::from_secs(3));
+}

@@ -1,0 +1,40 @@
+//! `getup replay`: the replay as a process.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::Result;
+use getup_replay::{ReplayMetrics, Store, serve};
+
+use crate::config::Config;
+use crate::role::{Role, RoleArgs, bind};
+
+/// Run the replay: stores what actors push, durably, and serves minibatches to the learner.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    role: RoleArgs,
+    /// The store's folder. [default: runs/<name of the run>/replay]
+    #[arg(long, value_name = "DIR")]
+    dir: Option<PathBuf>,
+}
+
+pub(crate) fn run(arguments: Args) -> Result<()> {
+    let config = arguments.role.config.load()?;
+    let role = Role::new("replay", arguments.role.log_format)?;
+    let dir = arguments.dir.unwrap_or_else(|| PathBuf::from("runs").join(&config.run).join("replay"));
+    role.run(start(&config, &role, dir))
+}
+
+async fn start(config: &Config, role: &Role, dir: PathBuf) -> Result<()> {
+    let listener = bind(&config.network.replay, "gRPC").await?;
+    role.serve_metrics(&config.network.replay_metrics).await?;
+    std::fs::create_dir_all(&dir)?;
+    let (spec, settings) = (config.run_spec()?, config.replay_config());
+    let metrics = ReplayMetrics::new(&role.registry);
+    let store = Store::open(&dir, &spec, &settings, metrics, role.waits.clone())?;
+    tracing::info!("replay serves gRPC at {}, its store is {}", listener.local_addr()?, dir.display());
+    serve(listener, Arc::new(store), role.shutdown.clone()).await?;
+    tracing::info!("replay ended: everything acknowledged is stored");
+    Ok(())
+}

@@ -1,0 +1,160 @@
+//! The program as its user meets it: results, resumption, and what it says to nonsense.
+
+mod common;
+
+use std::path::Path;
+use std::time::Duration;
+
+use common::{Process, fail, free_address, getup, succeed, wait_for};
+use serde_json::Value;
+
+/// `getup train` with the smoke preset in a folder of its own.
+fn train(folder: &Path, arguments: &[&str]) -> std::process::Command {
+    let mut command = getup(&["train", "--preset", "smoke"]);
+    command.args(["--set", &format!("network.learner_metrics={}", free_address())]);
+    command.args(arguments).current_dir(folder);
+    command
+}
+
+fn evaluations(run: &Path) -> Vec<Value> {
+    let text = std::fs::read_to_string(run.join("evaluations.jsonl")).unwrap_or_default();
+    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+#[test]
+fn a_run_is_interrupted_resumed_and_ended_by_its_steps() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().join("run");
+    let mut first = Process::start("first", folder.path(), &mut train(folder.path(), &["--run", "run"]));
+    wait_for("two evaluations", Duration::from_secs(60), || (evaluations(&run).len() >= 2).then_some(()));
+    first.signal("INT");
+    assert!(first.wait(Duration::from_secs(10)).success(), "{}", first.log());
+
+    let again = fail(&mut train(folder.path(), &["--run", "run"]));
+    assert!(again.contains("--resume --run run"), "{again}");
+    let mut resume = getup(&["train", "--run", "run", "--resume", "--preset", "laptop"]);
+    let other = fail(resume.current_dir(folder.path()));
+    assert!(other.contains("has preset smoke, not laptop"), "{other}");
+
+    let before = evaluations(&run).last().unwrap()["env_steps"].as_u64().unwrap();
+    let steps = (before + 2_000).to_string();
+    let mut resume = getup(&["train", "--run", "run", "--resume", "--steps", &steps]);
+    let said = succeed(resume.current_dir(folder.path()));
+    assert!(said.contains("Done:") && said.contains("evaluate"), "{said}");
+    let after = evaluations(&run).last().unwrap()["env_steps"].as_u64().unwrap();
+    assert!(after >= before + 2_000, "{after} env steps");
+    let model = run.join("models/last.safetensors");
+    let report = succeed(&mut getup(&["evaluate", model.to_str().unwrap(), "--episodes", "3", "--json", "--seed", "5"]));
+    let report: Value = serde_json::from_str(&report).unwrap();
+    for key in ["rise_rate", "stand_rate", "mean_return", "min_return", "beta", "episodes", "seed"] {
+        assert!(report[key].is_number(), "{key} in {report}");
+    }
+    // Past its steps already: it saves and ends.
+    let mut resume = getup(&["train", "--run", "run", "--resume", "--steps", "10"]);
+    assert!(succeed(resume.current_dir(folder.path())).contains("Done:"));
+}
+
+#[test]
+fn deterministic_runs_of_one_seed_are_equal_byte_for_byte_and_those_of_another_are_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let lines = |run: &str, seed: &str| {
+        succeed(&mut train(folder.path(), &["--deterministic", "--steps", "2500", "--run", run, "--seed", seed]));
+        std::fs::read(folder.path().join(run).join("evaluations.jsonl")).unwrap()
+    };
+    let first = lines("a", "3");
+    assert!(first.iter().filter(|byte| **byte == b'\n').count() >= 3);
+    assert_eq!(first, lines("b", "3"));
+    assert_ne!(first, lines("c", "4"));
+}
+
+#[test]
+fn a_processor_without_avx512_trains_in_both_precisions() {
+    let folder = tempfile::tempdir().unwrap();
+    for precision in ["fp32", "bf16"] {
+        let setting = format!("sac.precision={precision}");
+        let mut command = train(folder.path(), &["--steps", "1000", "--run", precision, "--set", &setting]);
+        // ATen's own kernels, oneDNN and MKL each choose their instructions.
+        command.env("ATEN_CPU_CAPABILITY", "default");
+        command.env("ONEDNN_MAX_CPU_ISA", "AVX2").env("MKL_ENABLE_INSTRUCTIONS", "AVX2");
+        succeed(&mut command);
+        assert!(folder.path().join(precision).join("models/last.safetensors").exists());
+    }
+}
+
+#[test]
+fn recorded_episodes_are_replayed_to_the_same_numbers() {
+    let folder = tempfile::tempdir().unwrap();
+    let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/sim/tests/golden/getup_cast.json");
+    let output = folder.path().join("out.json");
+    succeed(&mut getup(&["rollout", "--input", golden, "--output", output.to_str().unwrap()]));
+    let read = |path: &Path| -> Value { serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap() };
+    let (ours, theirs) = (read(&output), read(Path::new(golden)));
+    for key in ["rewards", "observations", "terms", "qpos"] {
+        assert_close(&ours["rollouts"][0][key], &theirs["rollouts"][0][key], key);
+    }
+    let missing = fail(&mut getup(&["rollout", "--input", "nowhere.json", "--output", "x.json"]));
+    assert!(missing.contains("cannot read nowhere.json"), "{missing}");
+}
+
+fn assert_close(ours: &Value, theirs: &Value, path: &str) {
+    match (ours, theirs) {
+        (Value::Array(ours), Value::Array(theirs)) => {
+            assert_eq!(ours.len(), theirs.len(), "{path}");
+            for (index, (ours, theirs)) in ours.iter().zip(theirs).enumerate() {
+                assert_close(ours, theirs, &format!("{path}[{index}]"));
+            }
+        }
+        _ => assert!((ours.as_f64().unwrap() - theirs.as_f64().unwrap()).abs() < 1e-9, "{path}"),
+    }
+}
+
+#[test]
+fn falls_are_written_and_repeat_by_their_seed() {
+    let folder = tempfile::tempdir().unwrap();
+    let draw = |name: &str| {
+        let path = folder.path().join(name);
+        succeed(&mut getup(&["falls", "--count", "6", "--seed", "9", "--output", path.to_str().unwrap()]));
+        std::fs::read(path).unwrap()
+    };
+    assert_eq!(draw("a.json"), draw("b.json"));
+    let falls: Value = serde_json::from_slice(&draw("a.json")).unwrap();
+    assert_eq!(falls["falls"].as_array().unwrap().len(), 6);
+}
+
+#[test]
+fn nonsense_is_answered_with_the_thing_the_value_and_the_way_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let said = |arguments: &[&str]| fail(train(folder.path(), arguments).env("RUST_BACKTRACE", "0"));
+    for (arguments, expected) in [
+        (&["--set", "sac.bach=3"][..], "unknown setting sac.bach; did you mean sac.batch?"),
+        (&["--set", "sac.gamma=1.5"], "sac.gamma = 1.5: at least 0 and under 1"),
+        (&["--set", "curriculum.n_min=9", "--set", "curriculum.n_max=3"], "at most curriculum.n_max"),
+        (&["--resume", "--run", "nowhere"], "there is no run in nowhere"),
+        (&["--config", "nowhere.toml"], "cannot read the configuration nowhere.toml"),
+    ] {
+        let stderr = said(arguments);
+        assert!(stderr.contains(expected), "{arguments:?} said:\n{stderr}");
+    }
+    let error = fail(&mut getup(&["evaluate", "Cargo.toml"]));
+    assert!(error.contains("not a getup model"), "{error}");
+    let error = fail(&mut getup(&["evaluate", "nowhere.safetensors"]));
+    assert!(error.contains("nowhere.safetensors"), "{error}");
+    assert!(folder.path().read_dir().unwrap().next().is_none(), "a refused command leaves nothing behind");
+}
+
+#[test]
+fn the_doctor_names_every_check_and_finds_a_taken_port() {
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = format!("network.replay={}", taken.local_addr().unwrap());
+    let mut command = getup(&["doctor", "--preset", "smoke", "--json", "--set", &address]);
+    for name in ["learner", "replay_metrics", "learner_metrics"] {
+        command.args(["--set", &format!("network.{name}={}", free_address())]);
+    }
+    let output = common::output(&mut command);
+    assert!(!output.status.success());
+    let checks: Vec<Value> = serde_json::from_slice(&output.stdout).unwrap();
+    for check in &checks {
+        assert_eq!(check["good"], check["name"] != "ports", "{check}");
+    }
+    assert!(checks.len() >= 7, "{checks:?}");
+}

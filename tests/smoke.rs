@@ -1,0 +1,172 @@
+//! The cluster in small: replay, learner and one actor as three real processes on loopback.
+
+mod common;
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use common::{Process, free_address, getup, metric, scrape, succeed, wait_for};
+use serde_json::Value;
+
+const LIMIT: Duration = Duration::from_secs(60);
+
+/// Addresses and folder of one cluster.
+struct Cluster {
+    folder: tempfile::TempDir,
+    addresses: [(&'static str, String); 5],
+}
+
+impl Cluster {
+    fn new() -> Self {
+        let names = ["replay", "learner", "replay_metrics", "learner_metrics", "actor_metrics"];
+        Self { folder: tempfile::tempdir().unwrap(), addresses: names.map(|name| (name, free_address())) }
+    }
+
+    fn address(&self, name: &str) -> &str {
+        &self.addresses.iter().find(|(known, _)| *known == name).unwrap().1
+    }
+
+    fn path(&self) -> &Path {
+        self.folder.path()
+    }
+
+    /// A command of this cluster: preset, addresses, a curriculum that a limp body passes.
+    fn command(&self, role: &str, omega: f64) -> Command {
+        let mut command = getup(&[role, "--preset", "smoke", "--set", "run=smoke"]);
+        command.args(["--set", &format!("curriculum.omega={omega}")]);
+        for (name, address) in &self.addresses {
+            command.args(["--set", &format!("network.{name}={address}")]);
+        }
+        command.current_dir(self.path());
+        command
+    }
+
+    fn start(&self, role: &'static str, omega: f64) -> Process {
+        Process::start(role, self.path(), self.command(role, omega).args(["--log-format", "json"]))
+    }
+
+    fn learner_metric(&self, name: &str) -> Option<f64> {
+        metric(self.address("learner_metrics"), &format!("getup_learner_{name}"))
+    }
+
+    fn status(&self) -> Option<Value> {
+        let output = self.command("status", 1.0).arg("--json").output().unwrap();
+        serde_json::from_slice(&output.stdout).ok()
+    }
+}
+
+fn wait_for_at_least(cluster: &Cluster, name: &str, least: f64) -> f64 {
+    wait_for(&format!("getup_learner_{name} >= {least}"), LIMIT, || {
+        cluster.learner_metric(name).filter(|value| *value >= least)
+    })
+}
+
+#[test]
+fn three_processes_train_promote_survive_a_kill_finish_and_end_with_0() {
+    let cluster = Cluster::new();
+    // In the order in which they need each other least.
+    let mut actor = cluster.start("actor", 1.0);
+    let mut learner = cluster.start("learner", 1.0);
+    std::thread::sleep(Duration::from_millis(500));
+    let mut replay = cluster.start("replay", 1.0);
+
+    wait_for_at_least(&cluster, "updates_total", 20.0);
+    wait_for_at_least(&cluster, "env_steps", 1_000.0);
+    wait_for_at_least(&cluster, "policy_version", 3.0);
+    wait_for_at_least(&cluster, "evaluations_total", 1.0);
+    wait_for_at_least(&cluster, "promotions_total", 1.0);
+    wait_for_at_least(&cluster, "checkpoints_total", 1.0);
+    wait_for("the actor acts by a policy that was trained", LIMIT, || {
+        let status = cluster.status()?;
+        let version = status["learner"]["actors"][0]["version"].as_str()?.to_owned();
+        version.strip_prefix("1.")?.parse::<u64>().ok().filter(|counter| *counter >= 2)
+    });
+    assert!(cluster.learner_metric("beta").unwrap() < 1.0);
+
+    let before = last_checkpoint_env_steps(cluster.path());
+    learner.signal("KILL");
+    assert!(!learner.wait(LIMIT).success());
+    // The same run, now with a threshold that nobody passes: the stage outlasts its limit.
+    let mut learner = cluster.start("learner", 1_000.0);
+    let resumed = wait_for("the learner resumes", LIMIT, || cluster.learner_metric("env_steps"));
+    assert!(resumed >= before, "{resumed} env steps after the kill, {before} in the checkpoint");
+    assert!(cluster.learner_metric("stage").unwrap() >= 1.0, "the curriculum goes on where it was");
+    wait_for_at_least(&cluster, "finished", 1.0);
+    let status = cluster.status().unwrap();
+    assert_eq!(status["learner"]["state"], "finished");
+    for process in [&mut actor, &mut learner, &mut replay] {
+        process.assert_running();
+    }
+
+    check_metrics(&cluster);
+    check_run_folder(&cluster.path().join("runs/smoke"));
+    for process in [&mut actor, &mut learner, &mut replay] {
+        process.signal("TERM");
+    }
+    for process in [&mut actor, &mut learner, &mut replay] {
+        let status = process.wait(Duration::from_secs(10));
+        assert!(status.success(), "{status}:\n{}", process.log());
+    }
+}
+
+fn last_checkpoint_env_steps(folder: &Path) -> f64 {
+    let files = std::fs::read_dir(folder.join("runs/smoke/checkpoints")).unwrap();
+    let steps = files.filter_map(|file| {
+        let name = file.unwrap().file_name().into_string().unwrap();
+        name.strip_prefix("step-")?.split('-').next()?.parse::<f64>().ok()
+    });
+    steps.fold(0.0, f64::max)
+}
+
+/// What was provoked above is in `/metrics` of each role, in a form that Prometheus' own linter accepts.
+fn check_metrics(cluster: &Cluster) {
+    let expected = [
+        ("actor_metrics", &["getup_actor_env_steps_total", "getup_actor_evaluations_total"][..]),
+        ("replay_metrics", &["getup_replay_env_steps_total", "getup_replay_sampled_transitions_total"]),
+        ("learner_metrics", &["getup_learner_evaluation_return_min", "getup_learner_temperature"]),
+    ];
+    for (role, names) in expected {
+        let text = scrape(cluster.address(role)).unwrap();
+        assert!(text.contains("getup_build_info"), "{role}");
+        for name in names {
+            let value = metric(cluster.address(role), name);
+            assert!(value.is_some_and(|value| value > 0.0), "{name} is {value:?} in\n{text}");
+        }
+        lint(role, &text);
+    }
+}
+
+fn lint(role: &str, text: &str) {
+    let linter = Command::new("promtool")
+        .args(["check", "metrics"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn();
+    let Ok(mut linter) = linter else {
+        eprintln!("skipped: promtool is not installed (Debian: apt-get install prometheus), {role} is not linted");
+        return;
+    };
+    std::io::Write::write_all(linter.stdin.as_mut().unwrap(), text.as_bytes()).unwrap();
+    let output = linter.wait_with_output().unwrap();
+    let complaints = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "promtool on {role}:\n{complaints}");
+}
+
+fn check_run_folder(folder: &Path) {
+    let lines = std::fs::read_to_string(folder.join("evaluations.jsonl")).unwrap();
+    let evaluations: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    for evaluation in &evaluations {
+        for key in ["version", "env_steps", "updates", "stage", "beta", "mean", "min", "returns"] {
+            assert!(!evaluation[key].is_null(), "{key} in {evaluation}");
+        }
+    }
+    let steps: Vec<u64> = evaluations.iter().map(|line| line["env_steps"].as_u64().unwrap()).collect();
+    assert!(steps.is_sorted(), "{steps:?}");
+    let best = folder.join("models/best.safetensors");
+    let report = succeed(getup(&["evaluate", best.to_str().unwrap(), "--episodes", "2", "--json"]).current_dir(folder));
+    let report: Value = serde_json::from_str(&report).unwrap();
+    assert_eq!(report["episodes"], 2);
+    assert!(report["beta"].as_f64().unwrap() <= 1.0);
+}
