@@ -9,10 +9,10 @@ use std::process::{Child, Command, ExitStatus, Output, Stdio};
 use std::time::{Duration, Instant};
 
 /// The program under test.
-pub const GETUP: &str = env!("CARGO_BIN_EXE_getup");
+pub(crate) const GETUP: &str = env!("CARGO_BIN_EXE_getup");
 
 /// A command of the program, without settings from this environment.
-pub fn getup(arguments: &[&str]) -> Command {
+pub(crate) fn getup(arguments: &[&str]) -> Command {
     let mut command = Command::new(GETUP);
     for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("GETUP_")) {
         command.env_remove(name);
@@ -22,12 +22,12 @@ pub fn getup(arguments: &[&str]) -> Command {
 }
 
 /// Runs a command to its end.
-pub fn output(command: &mut Command) -> Output {
+pub(crate) fn output(command: &mut Command) -> Output {
     command.output().expect("the program starts")
 }
 
 /// Runs a command that must succeed; its stdout.
-pub fn succeed(command: &mut Command) -> String {
+pub(crate) fn succeed(command: &mut Command) -> String {
     let output = output(command);
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{command:?} ended with {}:\n{stderr}", output.status);
@@ -35,14 +35,14 @@ pub fn succeed(command: &mut Command) -> String {
 }
 
 /// Runs a command that must fail; its stderr.
-pub fn fail(command: &mut Command) -> String {
+pub(crate) fn fail(command: &mut Command) -> String {
     let output = output(command);
     assert!(!output.status.success(), "{command:?} succeeded");
     String::from_utf8(output.stderr).expect("output is text")
 }
 
 /// A process that is killed when the test is over, its log in a file.
-pub struct Process {
+pub(crate) struct Process {
     child: Child,
     name: &'static str,
     log: PathBuf,
@@ -50,7 +50,7 @@ pub struct Process {
 
 impl Process {
     /// Starts a command; its stderr goes to `folder/<name>.log`, after what is there.
-    pub fn start(name: &'static str, folder: &Path, command: &mut Command) -> Self {
+    pub(crate) fn start(name: &'static str, folder: &Path, command: &mut Command) -> Self {
         let log = folder.join(format!("{name}.log"));
         let file = std::fs::OpenOptions::new().create(true).append(true).open(&log).expect("a log file");
         let child = command.stderr(file).stdout(Stdio::null()).spawn().expect("the program starts");
@@ -58,13 +58,13 @@ impl Process {
     }
 
     /// Sends a signal by its name, such as `TERM`.
-    pub fn signal(&self, signal: &str) {
+    pub(crate) fn signal(&self, signal: &str) {
         let status = Command::new("kill").args(["-s", signal, &self.child.id().to_string()]).status();
         assert!(status.expect("kill runs").success());
     }
 
     /// Waits for the end, at most `limit`.
-    pub fn wait(&mut self, limit: Duration) -> ExitStatus {
+    pub(crate) fn wait(&mut self, limit: Duration) -> ExitStatus {
         let until = Instant::now() + limit;
         loop {
             if let Some(status) = self.child.try_wait().expect("the process is ours") {
@@ -76,14 +76,14 @@ impl Process {
     }
 
     /// Fails the test if the process has ended.
-    pub fn assert_running(&mut self) {
+    pub(crate) fn assert_running(&mut self) {
         if let Some(status) = self.child.try_wait().expect("the process is ours") {
             panic!("{} ended with {status}:\n{}", self.name, self.log());
         }
     }
 
     /// What it has logged.
-    pub fn log(&self) -> String {
+    pub(crate) fn log(&self) -> String {
         std::fs::read_to_string(&self.log).unwrap_or_default()
     }
 }
@@ -97,12 +97,12 @@ impl Drop for Process {
 }
 
 /// An address on loopback that nobody listens at now.
-pub fn free_address() -> String {
+pub(crate) fn free_address() -> String {
     TcpListener::bind("127.0.0.1:0").expect("a free port").local_addr().expect("it is bound").to_string()
 }
 
 /// The text of `/metrics`; none where nobody answers.
-pub fn scrape(address: &str) -> Option<String> {
+pub(crate) fn scrape(address: &str) -> Option<String> {
     let mut stream = TcpStream::connect(address).ok()?;
     stream.set_read_timeout(Some(Duration::from_secs(5))).ok()?;
     let request = format!("GET /metrics HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
@@ -114,13 +114,13 @@ pub fn scrape(address: &str) -> Option<String> {
 }
 
 /// A sample without labels of `/metrics`.
-pub fn metric(address: &str, name: &str) -> Option<f64> {
+pub(crate) fn metric(address: &str, name: &str) -> Option<f64> {
     let text = scrape(address)?;
     text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' ')?.parse().ok())
 }
 
 /// Waits until `condition` gives something, at most `limit`; `what` names it where it does not.
-pub fn wait_for<T>(what: &str, limit: Duration, mut condition: impl FnMut() -> Option<T>) -> T {
+pub(crate) fn wait_for<T>(what: &str, limit: Duration, mut condition: impl FnMut() -> Option<T>) -> T {
     let until = Instant::now() + limit;
     loop {
         if let Some(value) = condition() {

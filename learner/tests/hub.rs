@@ -1,0 +1,196 @@
+//! The learner's interface to actors, driven the same way in process and over gRPC.
+#![cfg(feature = "torch")]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use getup_learner::hub::{Evaluation, Hub};
+use getup_learner::service::service;
+use getup_proto::v1::learner_client::LearnerClient;
+use getup_proto::{ColumnSpec, Rows, RunSpec, v1};
+use getup_telemetry::{Registry, Shutdown, Waits};
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio_stream::wrappers::TcpListenerStream;
+use tonic::transport::{Channel, Server};
+use tonic::{Code, Status, Streaming};
+
+fn spec(run: &str) -> RunSpec {
+    let columns = vec![ColumnSpec { name: "reward".into(), width: 1, rows: Rows::Steps }];
+    RunSpec { run: run.into(), task: "getup/standard".into(), columns, max_segment_steps: 64 }
+}
+
+fn hub(keep_alive: Duration) -> Arc<Hub> {
+    let waits = Waits::new(&Registry::new());
+    Arc::new(Hub::new(spec("hub"), vec![11, 12], keep_alive, 3, waits))
+}
+
+fn policy(counter: u64) -> Arc<v1::PolicyUpdate> {
+    Arc::new(v1::PolicyUpdate {
+        version: Some(v1::PolicyVersion { incarnation: 3, counter }),
+        networks: vec![v1::NamedNetwork { name: "policy".into(), model: vec![7; 5_000_000].into() }],
+        values: [("beta".to_owned(), 0.95)].into(),
+        ..v1::PolicyUpdate::default()
+    })
+}
+
+/// An actor's way to the hub.
+#[allow(clippy::large_enum_variant)]
+enum Door {
+    Here(Arc<Hub>),
+    Grpc(LearnerClient<Channel>),
+}
+
+enum Policies {
+    Here(watch::Receiver<Arc<v1::PolicyUpdate>>),
+    Grpc(Streaming<v1::PolicyUpdate>),
+}
+
+impl Door {
+    async fn both(hub: &Arc<Hub>, shutdown: &Shutdown) -> [Door; 2] {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = format!("http://{}", listener.local_addr().unwrap());
+        let (service, ended) = (service(Arc::clone(hub), shutdown.clone()), shutdown.clone());
+        let server = Server::builder().add_service(service);
+        let incoming = TcpListenerStream::new(listener);
+        tokio::spawn(server.serve_with_incoming_shutdown(incoming, async move { ended.wait().await }));
+        let client = LearnerClient::connect(address).await.unwrap();
+        let client = client.max_decoding_message_size(getup_proto::MAX_MESSAGE_BYTES);
+        [Door::Here(Arc::clone(hub)), Door::Grpc(client)]
+    }
+
+    async fn subscribe(&self, spec: &RunSpec) -> Result<Policies, Status> {
+        match self {
+            Door::Here(hub) => Ok(Policies::Here(hub.subscribe(spec)?)),
+            Door::Grpc(client) => {
+                let request = v1::SubscribeRequest { spec: Some(spec.to_wire()), actor: "actor".into() };
+                Ok(Policies::Grpc(client.clone().subscribe(request).await?.into_inner()))
+            }
+        }
+    }
+
+    async fn heartbeat(&self, actor: &str, lease: u64, idle: bool) -> Result<Option<v1::EvaluationLease>, Status> {
+        let request = v1::HeartbeatRequest { actor: actor.into(), lease, idle, ..v1::HeartbeatRequest::default() };
+        Ok(match self {
+            Door::Here(hub) => hub.heartbeat(request, Instant::now())?.lease,
+            Door::Grpc(client) => client.clone().heartbeat(request).await?.into_inner().lease,
+        })
+    }
+
+    async fn report(&self, lease: u64, returns: &[f64]) -> Result<(), Status> {
+        let episode = |&episode_return| v1::EpisodeResult { episode_return, ..v1::EpisodeResult::default() };
+        let episodes = returns.iter().map(episode).collect();
+        let report = v1::EvaluationReport { lease, actor: "actor".into(), episodes };
+        match self {
+            Door::Here(hub) => Ok(hub.report(report)?),
+            Door::Grpc(client) => client.clone().report(report).await.map(drop),
+        }
+    }
+}
+
+impl Policies {
+    /// The counter of the newest policy that has come.
+    async fn next(&mut self) -> u64 {
+        let update = match self {
+            Policies::Here(receiver) => {
+                if receiver.borrow().networks.is_empty() {
+                    receiver.changed().await.unwrap();
+                }
+                Arc::unwrap_or_clone(Arc::clone(&receiver.borrow_and_update()))
+            }
+            Policies::Grpc(stream) => stream.message().await.unwrap().unwrap(),
+        };
+        assert_eq!(update.networks[0].model.len(), 5_000_000);
+        update.version.unwrap().counter
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_newest_policy_is_had_at_once_and_versions_are_skipped_never_queued() {
+    let (hub, shutdown) = (hub(Duration::from_secs(10)), Shutdown::new());
+    for door in Door::both(&hub, &shutdown).await {
+        hub.publish(policy(1));
+        let mut policies = door.subscribe(&spec("hub")).await.unwrap();
+        assert_eq!(policies.next().await, 1);
+        for counter in 2..=40 {
+            hub.publish(policy(counter));
+            tokio::task::yield_now().await;
+        }
+        let mut seen = 0;
+        for received in 1.. {
+            let counter = match &mut policies {
+                Policies::Here(receiver) => receiver.borrow().version.unwrap().counter,
+                Policies::Grpc(_) => policies.next().await,
+            };
+            assert!(counter > seen, "never an older one");
+            seen = counter;
+            if seen == 40 {
+                assert!(received < 39, "a reader that sleeps skips versions");
+                break;
+            }
+        }
+    }
+    shutdown.trigger();
+}
+
+#[tokio::test]
+async fn an_evaluation_is_leased_kept_alive_and_reported_once() {
+    let (hub, shutdown) = (hub(Duration::from_secs(10)), Shutdown::new());
+    for door in Door::both(&hub, &shutdown).await {
+        assert!(door.heartbeat("a", 0, true).await.unwrap().is_none(), "nothing is offered");
+        hub.offer(Evaluation { policy: policy(5), updates: 100 });
+        assert!(door.heartbeat("a", 0, false).await.unwrap().is_none(), "it is busy");
+        let lease = door.heartbeat("a", 0, true).await.unwrap().unwrap();
+        assert_eq!((lease.seeds.as_slice(), lease.scenario.as_str()), ([11, 12].as_slice(), "falls"));
+        assert_eq!(lease.policy.unwrap().version.unwrap().counter, 5);
+        assert!(door.heartbeat("b", 0, true).await.unwrap().is_none(), "it is taken");
+
+        let code = |result: Result<(), Status>| result.unwrap_err().code();
+        assert_eq!(code(door.report(lease.id, &[1.0]).await), Code::InvalidArgument);
+        assert_eq!(code(door.report(lease.id, &[1.0, f64::NAN]).await), Code::InvalidArgument);
+        assert_eq!(code(door.report(lease.id + 1, &[1.0, 2.0]).await), Code::FailedPrecondition);
+        assert_eq!(code(door.report(1, &[1.0, 2.0]).await), Code::FailedPrecondition, "of an earlier learner");
+        assert_eq!(hub.outstanding(), 1, "what is refused changes nothing");
+        door.report(lease.id, &[1.0, 2.0]).await.unwrap();
+        assert_eq!(code(door.report(lease.id, &[1.0, 2.0]).await), Code::FailedPrecondition);
+        let (evaluation, episodes) = hub.take_reported().unwrap();
+        assert_eq!((evaluation.updates, episodes.len()), (100, 2));
+    }
+    shutdown.trigger();
+}
+
+#[tokio::test]
+async fn the_lease_of_a_silent_actor_goes_to_another() {
+    let (hub, shutdown) = (hub(Duration::from_millis(300)), Shutdown::new());
+    for door in Door::both(&hub, &shutdown).await {
+        hub.offer(Evaluation { policy: policy(5), updates: 1 });
+        let lost = door.heartbeat("a", 0, true).await.unwrap().unwrap();
+        for _ in 0..4 {
+            tokio::time::sleep(Duration::from_millis(100)).await;
+            door.heartbeat("a", lost.id, false).await.unwrap();
+            assert!(door.heartbeat("b", 0, true).await.unwrap().is_none(), "heartbeats keep it");
+        }
+        tokio::time::sleep(Duration::from_millis(400)).await;
+        let lease = door.heartbeat("b", 0, true).await.unwrap().unwrap();
+        assert_ne!(lease.id, lost.id);
+        assert_eq!(door.report(lost.id, &[1.0, 2.0]).await.unwrap_err().code(), Code::FailedPrecondition);
+        door.report(lease.id, &[3.0, 4.0]).await.unwrap();
+        assert_eq!(hub.take_reported().unwrap().1[0].episode_return, 3.0);
+    }
+    shutdown.trigger();
+}
+
+#[tokio::test]
+async fn actors_of_another_run_and_without_a_name_are_refused() {
+    let (hub, shutdown) = (hub(Duration::from_secs(10)), Shutdown::new());
+    for door in Door::both(&hub, &shutdown).await {
+        let error = door.subscribe(&spec("other")).await.err().unwrap();
+        assert_eq!(error.code(), Code::FailedPrecondition);
+        assert!(error.message().contains("other") && error.message().contains("hub"), "{}", error.message());
+        assert_eq!(door.heartbeat("", 0, true).await.unwrap_err().code(), Code::InvalidArgument);
+        door.heartbeat("a", 0, true).await.unwrap();
+        let actors = hub.status(Instant::now()).actors;
+        assert_eq!(actors.iter().map(|actor| actor.name.as_str()).collect::<Vec<_>>(), ["a"]);
+    }
+    shutdown.trigger();
+}
