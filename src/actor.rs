@@ -40,7 +40,8 @@ async fn serve(config: &Config, role: &Role, diverged: PathBuf) -> Result<()> {
     let network = &config.network;
     let waits = &role.waits;
     let writer = GrpcReplay::new(&url(&network.replay), setup.spec.clone(), identity, waits.clone())?;
-    let link = GrpcLearner::new(&url(&network.learner), setup.spec.clone(), &config.actor.name, waits.clone())?;
+    let link =
+        GrpcLearner::new(&url(&network.learner), setup.spec.clone(), &config.actor.name, waits.clone())?;
     role.serve_metrics(&network.actor_metrics).await?;
     let listener = bind(&network.actor, "gRPC health").await?;
     tracing::info!(name = config.actor.name, health = %listener.local_addr()?, "actor started");

@@ -4,22 +4,27 @@ mod layers;
 
 use std::path::Path;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use clap::Args;
 use getup_actor::config::ActorConfig;
 use getup_actor::explore::BetaDraw;
 use getup_learner::config::{CurriculumConfig, EvaluationConfig, LearnerConfig, SacConfig};
-use getup_replay::{ReplayConfig, SyncMode};
 use getup_proto::{ColumnSpec, Rows, RunSpec, columns};
+use getup_replay::{ReplayConfig, SyncMode};
 use getup_sim::{GetUp, Task, TaskConfig};
 use serde::{Deserialize, Serialize};
 
 pub(crate) use layers::Layers;
 
+/// The format of configuration files that this program writes and reads.
+const FORMAT: u32 = 1;
+
 /// Everything a run depends on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub(crate) struct Config {
+    /// The format of this file.
+    pub(crate) format: u32,
     /// The preset it began as.
     pub(crate) preset: String,
     /// The run's name; roles of different runs refuse each other.
@@ -90,6 +95,7 @@ impl Default for NetworkConfig {
 impl Default for Config {
     fn default() -> Self {
         Self {
+            format: FORMAT,
             preset: "laptop".into(),
             run: "getup".into(),
             seed: 0,
@@ -151,6 +157,11 @@ fn read_table(path: &Path) -> Result<toml::Table> {
 impl Config {
     /// Refuses settings that cannot work, alone or together.
     pub(crate) fn validate(&self) -> Result<()> {
+        ensure!(
+            self.format == FORMAT,
+            "format = {}: this getup reads configurations of format {FORMAT}; use the getup that wrote it",
+            self.format
+        );
         self.task.validate()?;
         self.actor.validate()?;
         self.replay_config().validate_for(&self.run_spec()?)?;
@@ -158,7 +169,7 @@ impl Config {
         self.curriculum.validate()?;
         self.evaluation.validate()?;
         self.learner.validate()?;
-        anyhow::ensure!(
+        ensure!(
             !self.run.is_empty() && self.run.len() <= 128,
             "run = {:?}: a run's name has 1 to 128 bytes",
             self.run
@@ -167,6 +178,7 @@ impl Config {
     }
 
     /// The file's text.
+    #[cfg(any(test, feature = "learner"))]
     pub(crate) fn to_toml(&self) -> Result<String> {
         toml::to_string_pretty(self).context("the configuration is not expressible in TOML")
     }
@@ -243,7 +255,10 @@ mod tests {
         assert_eq!((sac.hidden.as_slice(), sac.critics, sac.batch), ([1024, 1024].as_slice(), 2, 1024));
         assert_eq!((sac.actor_lr, sac.critic_lr, sac.temperature_lr), (1e-5, 1e-4, 1e-4));
         assert_eq!((sac.gamma, sac.tau, sac.initial_temperature, sac.n_step), (0.97, 0.005, 0.1, 1));
-        assert_eq!((sac.updates_per_step, sac.uniform_steps, sac.normalize_observations), (1.0, 10_000, false));
+        assert_eq!(
+            (sac.updates_per_step, sac.uniform_steps, sac.normalize_observations),
+            (1.0, 10_000, false)
+        );
         assert_eq!(sac.target_entropy.nats(21), -21.0);
         assert_eq!(config.replay.capacity, 1_000_000);
         assert!(config.actor.store_limp);
@@ -257,8 +272,10 @@ mod tests {
 
     #[test]
     fn later_layers_win() {
-        let environment = [("GETUP_SAC__BATCH", "64"), ("GETUP_SEED", "7"), ("GETUP_TEST_FULL", "1"), ("HOME", "/")];
-        let config = load(&["sac.batch=32", "sac.hidden=[8, 8]", "run=arms", "sac.target_entropy=-4"], &environment);
+        let environment =
+            [("GETUP_SAC__BATCH", "64"), ("GETUP_SEED", "7"), ("GETUP_TEST_FULL", "1"), ("HOME", "/")];
+        let config =
+            load(&["sac.batch=32", "sac.hidden=[8, 8]", "run=arms", "sac.target_entropy=-4"], &environment);
         let config = config.unwrap();
         assert_eq!((config.sac.batch, config.seed, config.run.as_str()), (32, 7, "arms"));
         assert_eq!((config.sac.hidden, config.sac.target_entropy.nats(21)), (vec![8, 8], -4.0));

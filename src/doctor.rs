@@ -81,7 +81,10 @@ fn physics(config: &Config) -> Result<String> {
 fn processor(config: &Config) -> Result<String> {
     let cores = std::thread::available_parallelism().context("cannot count the cores")?.get();
     let threads = config.actor.threads;
-    Ok(format!("{cores} cores for {threads} lane threads and {} learner threads", config.learner.effective_threads()))
+    Ok(format!(
+        "{cores} cores for {threads} lane threads and {} learner threads",
+        config.learner.effective_threads()
+    ))
 }
 
 fn memory(config: &Config) -> Result<String> {
@@ -98,7 +101,9 @@ fn memory(config: &Config) -> Result<String> {
     let needed = config.replay.capacity as u64 * transition * 3 / 2 + GIB;
     let [needed_gib, available_gib] = [needed, available].map(|bytes| bytes as f64 / GIB as f64);
     if needed > available {
-        bail!("a full replay needs about {needed_gib:.1} GiB, {available_gib:.1} GiB are free: lower replay.capacity");
+        bail!(
+            "a full replay needs about {needed_gib:.1} GiB, {available_gib:.1} GiB are free: lower replay.capacity"
+        );
     }
     Ok(format!("{available_gib:.1} GiB free, a full replay needs about {needed_gib:.1} GiB"))
 }
@@ -121,7 +126,8 @@ fn ports(config: &Config) -> Result<String> {
 
 fn disk(run: &Path) -> Result<String> {
     let folder = run.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("."));
-    let path = CString::new(folder.as_os_str().as_bytes()).context("the run's folder has a NUL in its name")?;
+    let path =
+        CString::new(folder.as_os_str().as_bytes()).context("the run's folder has a NUL in its name")?;
     // SAFETY: an all-zero statvfs is a valid value of that plain structure, `path` is NUL-terminated, and the
     // structure outlives the call.
     let (result, facts) = unsafe {
@@ -129,12 +135,16 @@ fn disk(run: &Path) -> Result<String> {
         (libc::statvfs(path.as_ptr(), &mut facts), facts)
     };
     if result != 0 {
-        return Err(std::io::Error::last_os_error()).with_context(|| format!("cannot measure {}", folder.display()));
+        return Err(std::io::Error::last_os_error())
+            .with_context(|| format!("cannot measure {}", folder.display()));
     }
-    let free = facts.f_bavail as u64 * facts.f_frsize as u64;
+    let free = facts.f_bavail * facts.f_frsize;
     let gib = free as f64 / GIB as f64;
     if free < 2 * GIB {
-        bail!("{gib:.1} GiB free at {}: a run needs 2 GiB; free some, or choose another --run", folder.display());
+        bail!(
+            "{gib:.1} GiB free at {}: a run needs 2 GiB; free some, or choose another --run",
+            folder.display()
+        );
     }
     Ok(format!("{gib:.1} GiB free at {}", folder.display()))
 }

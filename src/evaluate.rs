@@ -78,8 +78,9 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     };
     let task = TaskConfig { character, ..TaskConfig::default() };
     let mut evaluator = Evaluator::new(&task, beta.max(1.0), LANES.min(arguments.episodes))?;
-    let seeds: Vec<u64> =
-        (0..arguments.episodes as u64).map(|index| arguments.seed.wrapping_mul(SEED_STRIDE).wrapping_add(index)).collect();
+    let seeds: Vec<u64> = (0..arguments.episodes as u64)
+        .map(|index| arguments.seed.wrapping_mul(SEED_STRIDE).wrapping_add(index))
+        .collect();
     let bar = progress_bar(arguments.episodes as u64, "falls");
     let progress = |done: usize| {
         bar.set_position(done as u64);
@@ -108,7 +109,8 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
 
 fn summarize(episodes: &[EvaluatedEpisode], beta: f64, character: Character, seed: u64) -> Report {
     let count = episodes.len();
-    let mean = |value: &dyn Fn(&EvaluatedEpisode) -> f64| episodes.iter().map(value).sum::<f64>() / count as f64;
+    let mean =
+        |value: &dyn Fn(&EvaluatedEpisode) -> f64| episodes.iter().map(value).sum::<f64>() / count as f64;
     let rises = episodes.iter().filter(|episode| episode.rises()).count();
     let stands = episodes.iter().filter(|episode| episode.stands()).count();
     Report {
@@ -159,11 +161,17 @@ mod tests {
     #[test]
     fn the_interval_is_wilsons() {
         // Reference: scipy.stats.binomtest(…).proportion_ci(method="wilson").
-        for (hits, count, low, high) in
-            [(0, 10, 0.0, 0.277_533), (10, 10, 0.722_467, 1.0), (99, 100, 0.945_514, 0.998_233), (45, 50, 0.786_398, 0.956_523)]
-        {
+        for (hits, count, low, high) in [
+            (0, 10, 0.0, 0.277_533),
+            (10, 10, 0.722_467, 1.0),
+            (99, 100, 0.945_514, 0.998_233),
+            (45, 50, 0.786_398, 0.956_523),
+        ] {
             let [ours_low, ours_high] = wilson_interval(hits, count);
-            assert!((ours_low - low).abs() < 1e-5 && (ours_high - high).abs() < 1e-5, "{ours_low} {ours_high}");
+            assert!(
+                (ours_low - low).abs() < 1e-5 && (ours_high - high).abs() < 1e-5,
+                "{ours_low} {ours_high}"
+            );
         }
     }
 }

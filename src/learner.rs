@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Result;
-use getup_learner::hub::Hub;
 use getup_learner::device::{self, Device};
+use getup_learner::hub::Hub;
 use getup_learner::run_folder::{RunFolder, write_atomically};
 use getup_learner::sac::TaskShape;
 use getup_learner::service::service;
@@ -14,10 +14,11 @@ use getup_learner::trainer::{Ending, Trainer, TrainerConfig};
 use getup_replay::{RemoteOptions, RemoteSource, SampleOptions};
 use getup_sim::{GetUp, Task};
 use getup_telemetry::health;
+use rand::{RngCore, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use tokio_stream::wrappers::TcpListenerStream;
 
 use crate::config::Config;
-use crate::links::evaluation_seeds;
 use crate::role::{Role, RoleArgs, bind};
 
 /// Minibatches that are on their way while one is trained on.
@@ -30,7 +31,7 @@ const PREFETCH: usize = 8;
 pub(crate) struct Args {
     #[command(flatten)]
     role: RoleArgs,
-    /// The run's folder: checkpoints, models, evaluations. [default: runs/<name of the run>]
+    /// The run's folder: checkpoints, models, evaluations. [default: `runs/` and the run's name]
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
 }
@@ -89,6 +90,12 @@ pub(crate) fn make_hub(config: &Config, role: &Role, folder: &RunFolder) -> Resu
     let keep_alive = Duration::from_secs_f64(config.evaluation.lease_seconds);
     let hub = Hub::new(config.run_spec()?, seeds, keep_alive, incarnation, role.waits.clone());
     Ok((Arc::new(hub), incarnation))
+}
+
+/// The seeds of a run's evaluations: the same fallen states throughout.
+fn evaluation_seeds(run_seed: u64, episodes: usize) -> Vec<u64> {
+    let mut rng = ChaCha8Rng::seed_from_u64(run_seed);
+    (0..episodes).map(|_| rng.next_u64()).collect()
 }
 
 /// The trainer of this run, on its newest checkpoint where it resumes.

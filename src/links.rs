@@ -4,17 +4,18 @@
 //! stream are, and the store takes segments as its service does.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use getup_actor::identity::Identity;
-use getup_actor::link::{LinkError, SegmentWriter};
-use getup_proto::Segment;
+use getup_actor::link::{
+    EpisodeResult, Heartbeat, LearnerLink, Lease, LinkError, PolicySlot, PolicyUpdate, Reported,
+    SegmentWriter,
+};
+use getup_learner::hub::{Hub, HubError};
+use getup_learner::leases::LeaseError;
+use getup_proto::{RunSpec, Segment, v1};
 use getup_replay::{Store, StoreError};
 use getup_telemetry::Shutdown;
-use rand::{RngCore, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-
-#[cfg(feature = "learner")]
-pub(crate) use learner::HubLink;
 
 /// Appends to a store in this process.
 pub(crate) struct StoreWriter {
@@ -49,68 +50,51 @@ impl SegmentWriter for StoreWriter {
             Ok::<(), StoreError>(())
         };
         let appended = tokio::task::spawn_blocking(append).await;
-        appended.map_err(|error| LinkError::Refused(error.to_string()))?.map_err(|error| LinkError::Refused(error.to_string()))
+        appended
+            .map_err(|error| LinkError::Refused(error.to_string()))?
+            .map_err(|error| LinkError::Refused(error.to_string()))
     }
 }
 
-/// The seeds of a run's evaluations: the same fallen states throughout.
-pub(crate) fn evaluation_seeds(run_seed: u64, episodes: usize) -> Vec<u64> {
-    let mut rng = ChaCha8Rng::seed_from_u64(run_seed);
-    (0..episodes).map(|_| rng.next_u64()).collect()
+/// The hub of a learner in this process.
+pub(crate) struct HubLink {
+    pub(crate) hub: Arc<Hub>,
+    pub(crate) spec: RunSpec,
+    /// The actor's name.
+    pub(crate) name: String,
 }
 
-#[cfg(feature = "learner")]
-mod learner {
-    use std::sync::Arc;
-    use std::time::Instant;
+fn refused(error: impl ToString) -> LinkError {
+    LinkError::Refused(error.to_string())
+}
 
-    use getup_actor::link::{
-        EpisodeResult, Heartbeat, LearnerLink, Lease, LinkError, PolicySlot, PolicyUpdate, Reported,
-    };
-    use getup_learner::hub::{Hub, HubError};
-    use getup_learner::leases::LeaseError;
-    use getup_proto::{RunSpec, v1};
-
-    /// The hub of a learner in this process.
-    pub(crate) struct HubLink {
-        pub(crate) hub: Arc<Hub>,
-        pub(crate) spec: RunSpec,
-        /// The actor's name.
-        pub(crate) name: String,
-    }
-
-    fn refused(error: impl ToString) -> LinkError {
-        LinkError::Refused(error.to_string())
-    }
-
-    impl LearnerLink for HubLink {
-        async fn subscribe(&self, slot: PolicySlot) -> Result<(), LinkError> {
-            let mut policies = self.hub.subscribe(&self.spec).map_err(refused)?;
-            loop {
-                let policy = Arc::clone(&policies.borrow_and_update());
-                if !policy.networks.is_empty() {
-                    let update = PolicyUpdate::parse(v1::PolicyUpdate::clone(&policy)).map_err(refused)?;
-                    slot.send_replace(Some(Arc::new(update)));
-                }
-                if policies.changed().await.is_err() {
-                    return Ok(());
-                }
+impl LearnerLink for HubLink {
+    async fn subscribe(&self, slot: PolicySlot) -> Result<(), LinkError> {
+        let mut policies = self.hub.subscribe(&self.spec).map_err(refused)?;
+        loop {
+            let policy = Arc::clone(&policies.borrow_and_update());
+            if !policy.networks.is_empty() {
+                let update = PolicyUpdate::parse(v1::PolicyUpdate::clone(&policy)).map_err(refused)?;
+                slot.send_replace(Some(Arc::new(update)));
+            }
+            if policies.changed().await.is_err() {
+                return Ok(());
             }
         }
+    }
 
-        async fn heartbeat(&self, beat: Heartbeat) -> Result<Option<Lease>, LinkError> {
-            let reply = self.hub.heartbeat(beat.into(), Instant::now()).map_err(refused)?;
-            reply.lease.map(Lease::parse).transpose().map_err(refused)
-        }
+    async fn heartbeat(&self, beat: Heartbeat) -> Result<Option<Lease>, LinkError> {
+        let reply = self.hub.heartbeat(beat.into(), Instant::now()).map_err(refused)?;
+        reply.lease.map(Lease::parse).transpose().map_err(refused)
+    }
 
-        async fn report(&self, lease: u64, episodes: Vec<EpisodeResult>) -> Result<Reported, LinkError> {
-            let episodes = episodes.into_iter().map(v1::EpisodeResult::from).collect();
-            let report = v1::EvaluationReport { lease, actor: self.name.clone(), episodes };
-            match self.hub.report(report) {
-                Ok(()) => Ok(Reported::Accepted),
-                Err(HubError::Lease(LeaseError::NotHeld(_))) => Ok(Reported::LeaseLost),
-                Err(error) => Err(refused(error)),
-            }
+    async fn report(&self, lease: u64, episodes: Vec<EpisodeResult>) -> Result<Reported, LinkError> {
+        let episodes = episodes.into_iter().map(v1::EpisodeResult::from).collect();
+        let report = v1::EvaluationReport { lease, actor: self.name.clone(), episodes };
+        match self.hub.report(report) {
+            Ok(()) => Ok(Reported::Accepted),
+            Err(HubError::Lease(LeaseError::NotHeld(_))) => Ok(Reported::LeaseLost),
+            Err(error) => Err(refused(error)),
         }
     }
 }

@@ -10,6 +10,7 @@ mod evaluate;
 mod falls;
 #[cfg(feature = "learner")]
 mod learner;
+#[cfg(feature = "learner")]
 mod links;
 mod output;
 mod replay;

@@ -14,7 +14,7 @@ use crate::role::{Role, RoleArgs, bind};
 pub(crate) struct Args {
     #[command(flatten)]
     role: RoleArgs,
-    /// The store's folder. [default: runs/<name of the run>/replay]
+    /// The store's folder. [default: `replay` in the run's folder]
     #[arg(long, value_name = "DIR")]
     dir: Option<PathBuf>,
 }

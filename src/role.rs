@@ -28,6 +28,7 @@ pub(crate) struct Role {
     pub(crate) waits: Waits,
     pub(crate) shutdown: Shutdown,
     /// Where progress bars go; log lines step aside for them.
+    #[cfg(feature = "learner")]
     pub(crate) progress: MultiProgress,
 }
 
@@ -39,7 +40,13 @@ impl Role {
         init_logging(log_format, move || LogWriter(writer.clone()))?;
         let registry = Registry::new();
         build_info(&registry, name);
-        Ok(Self { waits: Waits::new(&registry), registry, shutdown: Shutdown::new(), progress })
+        Ok(Self {
+            waits: Waits::new(&registry),
+            registry,
+            shutdown: Shutdown::new(),
+            #[cfg(feature = "learner")]
+            progress,
+        })
     }
 
     /// Runs `work` on a runtime of its own until it ends; SIGTERM and Ctrl-C trigger the shutdown that it awaits.

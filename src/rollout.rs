@@ -34,7 +34,10 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     write_file(&arguments.output, &played.to_json())?;
     let steps: usize = played.rollouts.iter().map(|rollout| rollout.rewards.len()).sum();
     let (count, output) = (played.rollouts.len(), arguments.output.display());
-    eprintln!("{count} rollouts of the {} character, {steps} control steps. Written to {output}", played.character);
+    eprintln!(
+        "{count} rollouts of the {} character, {steps} control steps. Written to {output}",
+        played.character
+    );
     for (index, rollout) in played.rollouts.iter().enumerate() {
         if let Some(diverged) = &rollout.diverged {
             eprintln!("rollout {index} diverged at step {}: {}", diverged.step, diverged.cause);

@@ -29,7 +29,8 @@ pub(crate) async fn run(arguments: Args) -> Result<()> {
     let (replay, learner) = tokio::join!(ask_replay(replay), ask_learner(learner));
     if arguments.json {
         let replay = replay.as_ref().map_or_else(|error| json!({"error": format!("{error:#}")}), replay_json);
-        let learner = learner.as_ref().map_or_else(|error| json!({"error": format!("{error:#}")}), learner_json);
+        let learner =
+            learner.as_ref().map_or_else(|error| json!({"error": format!("{error:#}")}), learner_json);
         println!("{}", json!({"replay": replay, "learner": learner}));
         return Ok(());
     }
@@ -46,7 +47,8 @@ pub(crate) async fn run(arguments: Args) -> Result<()> {
 }
 
 async fn channel(address: &str) -> Result<tonic::transport::Channel> {
-    let endpoint = Endpoint::from_shared(format!("http://{address}")).with_context(|| format!("{address:?}"))?;
+    let endpoint =
+        Endpoint::from_shared(format!("http://{address}")).with_context(|| format!("{address:?}"))?;
     let endpoint = endpoint.connect_timeout(TIMEOUT).timeout(TIMEOUT);
     endpoint.connect().await.with_context(|| format!("nothing answers at {address}"))
 }
@@ -78,14 +80,23 @@ fn print_replay(reply: &v1::DescribeReply) {
     );
     println!("         {}", or_nobody(&limiter.waiting));
     for writer in &reply.writers {
-        println!("         writer {}: {} segments, silent for {:.0} s", writer.name, writer.durable_sequence, writer.silent_seconds);
+        println!(
+            "         writer {}: {} segments, silent for {:.0} s",
+            writer.name, writer.durable_sequence, writer.silent_seconds
+        );
     }
 }
 
 fn print_learner(reply: &v1::StatusReply) {
     println!(
         "learner  {}: run {}, {} env steps, {} updates ({:.0}/s), stage {}, β = {:.3}",
-        reply.state, reply.run, reply.env_steps, reply.updates, reply.updates_per_second, reply.stage, reply.beta
+        reply.state,
+        reply.run,
+        reply.env_steps,
+        reply.updates,
+        reply.updates_per_second,
+        reply.stage,
+        reply.beta
     );
     println!("         {}", or_nobody(&reply.waiting));
     if let Some(evaluation) = &reply.evaluation {

@@ -29,7 +29,7 @@ use crate::role::Role;
 pub(crate) struct Args {
     #[command(flatten)]
     config: ConfigArgs,
-    /// The run's folder. [default: runs/<preset>-<seed>]
+    /// The run's folder. [default: `runs/` with preset and seed, such as runs/laptop-0]
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
     /// Go on with the run in that folder, under its own config.toml.
@@ -57,7 +57,9 @@ pub(crate) fn run(mut arguments: Args) -> Result<()> {
     let (config, folder) = prepare(&mut arguments)?;
     let role = Role::new("train", arguments.log_format)?;
     let ending = if arguments.deterministic {
-        role.run(async { tokio::task::block_in_place(|| deterministic::train(&config, &role, &folder, arguments.resume)) })
+        role.run(async {
+            tokio::task::block_in_place(|| deterministic::train(&config, &role, &folder, arguments.resume))
+        })
     } else {
         role.run(train(&config, &role, &folder, arguments.resume))
     }?;
@@ -70,17 +72,22 @@ fn prepare(arguments: &mut Args) -> Result<(Config, RunFolder)> {
     let shorthands = [
         arguments.seed.map(|seed| format!("seed={seed}")),
         arguments.steps.map(|steps| format!("steps={steps}")),
-        arguments.device.map(|device| format!("learner.device={}", if device == Device::Cuda { "cuda" } else { "cpu" })),
+        arguments
+            .device
+            .map(|device| format!("learner.device={}", if device == Device::Cuda { "cuda" } else { "cpu" })),
     ];
     arguments.config.set.extend(shorthands.into_iter().flatten());
     if arguments.resume {
         return prepare_resumed(arguments);
     }
     let mut config = arguments.config.load()?;
-    let path = arguments.run.clone().unwrap_or_else(|| format!("runs/{}-{}", config.preset, config.seed).into());
+    let path =
+        arguments.run.clone().unwrap_or_else(|| format!("runs/{}-{}", config.preset, config.seed).into());
     if path.join("config.toml").exists() {
         let shown = path.display();
-        bail!("{shown} holds a run already: go on with it by `--resume --run {shown}`, or choose another --run");
+        bail!(
+            "{shown} holds a run already: go on with it by `--resume --run {shown}`, or choose another --run"
+        );
     }
     name_after_folder(&mut config, &path);
     let folder = RunFolder::new(path);
@@ -100,8 +107,15 @@ fn prepare_resumed(arguments: &mut Args) -> Result<(Config, RunFolder)> {
     };
     let folder = RunFolder::new(path);
     let file = folder.config();
-    ensure!(file.exists(), "--resume: there is no run in {}: name its folder with --run", folder.root().display());
-    ensure!(arguments.config.config.is_none(), "--resume starts from the run's own config.toml, not from --config");
+    ensure!(
+        file.exists(),
+        "--resume: there is no run in {}: name its folder with --run",
+        folder.root().display()
+    );
+    ensure!(
+        arguments.config.config.is_none(),
+        "--resume starts from the run's own config.toml, not from --config"
+    );
     arguments.config.config = Some(file);
     let config = arguments.config.load()?;
     if let Some(preset) = preset
@@ -132,7 +146,8 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bool) -
     let spec = config.run_spec()?;
     let store = open_store(config, role, folder)?;
     let (hub, incarnation) = make_hub(config, role, folder)?;
-    let mut trainer = make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, resume)?;
+    let mut trainer =
+        make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, resume)?;
     let options = sample_options(config, incarnation);
     let mut source = LocalSource::new(Arc::clone(&store), options, "learner", role.shutdown.clone())?;
     let bar = progress::Progress::start(role, config, Arc::clone(&hub));

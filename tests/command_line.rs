@@ -1,5 +1,7 @@
 //! The program as its user meets it: results, resumption, and what it says to nonsense.
 
+#![cfg(feature = "learner")]
+
 mod common;
 
 use std::path::Path;
@@ -44,7 +46,15 @@ fn a_run_is_interrupted_resumed_and_ended_by_its_steps() {
     let after = evaluations(&run).last().unwrap()["env_steps"].as_u64().unwrap();
     assert!(after >= before + 2_000, "{after} env steps");
     let model = run.join("models/last.safetensors");
-    let report = succeed(&mut getup(&["evaluate", model.to_str().unwrap(), "--episodes", "3", "--json", "--seed", "5"]));
+    let report = succeed(&mut getup(&[
+        "evaluate",
+        model.to_str().unwrap(),
+        "--episodes",
+        "3",
+        "--json",
+        "--seed",
+        "5",
+    ]));
     let report: Value = serde_json::from_str(&report).unwrap();
     for key in ["rise_rate", "stand_rate", "mean_return", "min_return", "beta", "episodes", "seed"] {
         assert!(report[key].is_number(), "{key} in {report}");
@@ -58,7 +68,10 @@ fn a_run_is_interrupted_resumed_and_ended_by_its_steps() {
 fn deterministic_runs_of_one_seed_are_equal_byte_for_byte_and_those_of_another_are_not() {
     let folder = tempfile::tempdir().unwrap();
     let lines = |run: &str, seed: &str| {
-        succeed(&mut train(folder.path(), &["--deterministic", "--steps", "2500", "--run", run, "--seed", seed]));
+        succeed(&mut train(
+            folder.path(),
+            &["--deterministic", "--steps", "2500", "--run", run, "--seed", seed],
+        ));
         std::fs::read(folder.path().join(run).join("evaluations.jsonl")).unwrap()
     };
     let first = lines("a", "3");
@@ -87,7 +100,8 @@ fn recorded_episodes_are_replayed_to_the_same_numbers() {
     let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/sim/tests/golden/getup_cast.json");
     let output = folder.path().join("out.json");
     succeed(&mut getup(&["rollout", "--input", golden, "--output", output.to_str().unwrap()]));
-    let read = |path: &Path| -> Value { serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap() };
+    let read =
+        |path: &Path| -> Value { serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap() };
     let (ours, theirs) = (read(&output), read(Path::new(golden)));
     for key in ["rewards", "observations", "terms", "qpos"] {
         assert_close(&ours["rollouts"][0][key], &theirs["rollouts"][0][key], key);

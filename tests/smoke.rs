@@ -1,5 +1,7 @@
 //! The cluster in small: replay, learner and one actor as three real processes on loopback.
 
+#![cfg(feature = "learner")]
+
 mod common;
 
 use std::path::Path;
@@ -145,7 +147,9 @@ fn lint(role: &str, text: &str) {
         .stderr(Stdio::piped())
         .spawn();
     let Ok(mut linter) = linter else {
-        eprintln!("skipped: promtool is not installed (Debian: apt-get install prometheus), {role} is not linted");
+        eprintln!(
+            "skipped: promtool is not installed (Debian: apt-get install prometheus), {role} is not linted"
+        );
         return;
     };
     std::io::Write::write_all(linter.stdin.as_mut().unwrap(), text.as_bytes()).unwrap();
@@ -165,7 +169,9 @@ fn check_run_folder(folder: &Path) {
     let steps: Vec<u64> = evaluations.iter().map(|line| line["env_steps"].as_u64().unwrap()).collect();
     assert!(steps.is_sorted(), "{steps:?}");
     let best = folder.join("models/best.safetensors");
-    let report = succeed(getup(&["evaluate", best.to_str().unwrap(), "--episodes", "2", "--json"]).current_dir(folder));
+    let report = succeed(
+        getup(&["evaluate", best.to_str().unwrap(), "--episodes", "2", "--json"]).current_dir(folder),
+    );
     let report: Value = serde_json::from_str(&report).unwrap();
     assert_eq!(report["episodes"], 2);
     assert!(report["beta"].as_f64().unwrap() <= 1.0);

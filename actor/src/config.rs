@@ -30,7 +30,7 @@ impl Default for ActorConfig {
             lanes: 16,
             threads: 1,
             segment_steps: 64,
-            queue_segments: 64,
+            queue_segments: 16,
             store_limp: true,
             drain_seconds: 5.0,
         }

@@ -46,7 +46,9 @@ pub enum CheckpointError {
         problem: String,
     },
     /// The file was written by a newer program.
-    #[error("the checkpoint {path} has format version {found}, this program reads up to {VERSION}: update getup")]
+    #[error(
+        "the checkpoint {path} has format version {found}, this program reads up to {VERSION}: update getup"
+    )]
     Version {
         /// The file.
         path: PathBuf,
@@ -128,7 +130,8 @@ fn buffers(sac: &Sac) -> [(&'static str, &Tensor); 7] {
 impl Checkpoint {
     /// Copies the state of training; the copy is the caller's to write while training goes on.
     pub fn take(sac: &Sac, curriculum: &Curriculum, progress: &Progress) -> Self {
-        let tensors = buffers(sac).into_iter().map(|(name, tensor)| (name.to_owned(), to_vec(tensor))).collect();
+        let tensors =
+            buffers(sac).into_iter().map(|(name, tensor)| (name.to_owned(), to_vec(tensor))).collect();
         let scalars = Scalars {
             updates: sac.updates,
             actor_steps: sac.actor_adam.steps,
@@ -215,7 +218,9 @@ impl Checkpoint {
         let data: Vec<(&str, Vec<u8>)> = self
             .tensors
             .iter()
-            .map(|(name, values)| (name.as_str(), values.iter().flat_map(|value| value.to_le_bytes()).collect()))
+            .map(|(name, values)| {
+                (name.as_str(), values.iter().flat_map(|value| value.to_le_bytes()).collect())
+            })
             .collect();
         let views = data.iter().map(|(name, bytes)| {
             let view = TensorView::new(Dtype::F32, vec![bytes.len() / 4], bytes);

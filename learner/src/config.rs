@@ -15,7 +15,12 @@ pub struct ConfigError {
     pub wanted: &'static str,
 }
 
-fn check(good: bool, key: &'static str, value: &dyn ToString, wanted: &'static str) -> Result<(), ConfigError> {
+fn check(
+    good: bool,
+    key: &'static str,
+    value: &dyn ToString,
+    wanted: &'static str,
+) -> Result<(), ConfigError> {
     if good { Ok(()) } else { Err(ConfigError { key, value: value.to_string(), wanted }) }
 }
 
@@ -251,7 +256,12 @@ impl EvaluationConfig {
     /// Refuses settings under which nothing would be evaluated.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check(self.every > 0, "evaluation.every", &self.every, "at least 1")?;
-        check((1..=10_000).contains(&self.episodes), "evaluation.episodes", &self.episodes, "from 1 to 10000")?;
+        check(
+            (1..=10_000).contains(&self.episodes),
+            "evaluation.episodes",
+            &self.episodes,
+            "from 1 to 10000",
+        )?;
         let seconds = self.lease_seconds;
         check((1.0..=3600.0).contains(&seconds), "evaluation.lease_seconds", &seconds, "from 1 to 3600")
     }
@@ -290,16 +300,24 @@ impl std::str::FromStr for Device {
         match text {
             "cpu" => Ok(Self::Cpu),
             "cuda" => Ok(Self::Cuda),
-            _ => {
-                Err(ConfigError { key: "learner.device", value: text.to_owned(), wanted: "\"cpu\" or \"cuda\"" })
-            }
+            _ => Err(ConfigError {
+                key: "learner.device",
+                value: text.to_owned(),
+                wanted: "\"cpu\" or \"cuda\"",
+            }),
         }
     }
 }
 
 impl Default for LearnerConfig {
     fn default() -> Self {
-        Self { device: Device::Cpu, threads: 0, publish_every: 20, checkpoint_seconds: 60.0, checkpoints_kept: 3 }
+        Self {
+            device: Device::Cpu,
+            threads: 0,
+            publish_every: 20,
+            checkpoint_seconds: 60.0,
+            checkpoints_kept: 3,
+        }
     }
 }
 

@@ -15,10 +15,14 @@ pub enum DeviceError {
     )]
     Library(String),
     /// There is no device.
-    #[error("--device cuda: libtorch sees no NVIDIA device (is the driver loaded? see nvidia-smi); use --device cpu")]
+    #[error(
+        "--device cuda: libtorch sees no NVIDIA device (is the driver loaded? see nvidia-smi); use --device cpu"
+    )]
     NoDevice,
     /// It computes nonsense.
-    #[error("libtorch sums four ones to {0}: its installation is broken; remove .native and run `cargo xtask setup`")]
+    #[error(
+        "libtorch sums four ones to {0}: its installation is broken; remove .native and run `cargo xtask setup`"
+    )]
     Wrong(f64),
 }
 

@@ -90,7 +90,8 @@ impl Hub {
     /// A hub whose evaluations start from `seeds` and whose leases last `keep_alive`. `incarnation` numbers the
     /// learner's starts on this run.
     pub fn new(spec: RunSpec, seeds: Vec<u64>, keep_alive: Duration, incarnation: u64, waits: Waits) -> Self {
-        let state = State { leases: Leases::new(keep_alive), actors: BTreeMap::new(), standing: Standing::default() };
+        let state =
+            State { leases: Leases::new(keep_alive), actors: BTreeMap::new(), standing: Standing::default() };
         Self {
             spec,
             seeds,
@@ -137,11 +138,16 @@ impl Hub {
     /// Blocks until something is reported, at most `timeout`.
     pub fn wait_for_report(&self, timeout: Duration) {
         let guard = self.lock();
-        let _unused = self.reported.wait_timeout(guard, timeout).unwrap_or_else(|poisoned| poisoned.into_inner());
+        let _unused =
+            self.reported.wait_timeout(guard, timeout).unwrap_or_else(|poisoned| poisoned.into_inner());
     }
 
     /// Counts an actor in, keeps its lease, and gives it one where it is idle and there is one.
-    pub fn heartbeat(&self, request: v1::HeartbeatRequest, now: Instant) -> Result<v1::HeartbeatReply, HubError> {
+    pub fn heartbeat(
+        &self,
+        request: v1::HeartbeatRequest,
+        now: Instant,
+    ) -> Result<v1::HeartbeatReply, HubError> {
         if request.actor.is_empty() || request.actor.len() > 256 {
             return Err(HubError::Malformed("an actor's name has 1 to 256 bytes".into()));
         }

@@ -11,7 +11,9 @@ use std::time::{Duration, Instant};
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum LeaseError {
     /// The lease was never given, was reported, or went to another holder.
-    #[error("lease {0} is not held: it was reported already, or its holder was silent and it went to another actor")]
+    #[error(
+        "lease {0} is not held: it was reported already, or its holder was silent and it went to another actor"
+    )]
     NotHeld(u64),
     /// The report has another number of episodes than the lease.
     #[error("lease {lease} asks for {wanted} episodes, the report has {got}")]
@@ -64,8 +66,7 @@ impl<T, R> Leases<T, R> {
     /// The oldest evaluation nobody holds, now leased to `holder`, with the lease's number.
     pub fn acquire(&mut self, holder: &str, now: Instant) -> Option<(u64, &T)> {
         self.expire(now);
-        let (evaluation, state) =
-            self.table.iter_mut().find(|(_, state)| matches!(state, State::Offered))?;
+        let (evaluation, state) = self.table.iter_mut().find(|(_, state)| matches!(state, State::Offered))?;
         let id = self.next_id;
         self.next_id += 1;
         *state = State::Leased { id, holder: holder.to_owned(), expires: now + self.keep_alive };
@@ -87,7 +88,10 @@ impl<T, R> Leases<T, R> {
 
     /// Takes the report of a lease.
     pub fn report(&mut self, lease: u64, result: R) -> Result<(), LeaseError> {
-        let held = self.table.iter_mut().find(|(_, state)| matches!(state, State::Leased { id, .. } if *id == lease));
+        let held = self
+            .table
+            .iter_mut()
+            .find(|(_, state)| matches!(state, State::Leased { id, .. } if *id == lease));
         match held {
             Some((_, state)) => {
                 *state = State::Reported(result);
@@ -99,7 +103,8 @@ impl<T, R> Leases<T, R> {
 
     /// The evaluation of a lease that is held.
     pub fn held(&self, lease: u64) -> Option<&T> {
-        let held = self.table.iter().find(|(_, state)| matches!(state, State::Leased { id, .. } if *id == lease));
+        let held =
+            self.table.iter().find(|(_, state)| matches!(state, State::Leased { id, .. } if *id == lease));
         held.map(|(evaluation, _)| evaluation)
     }
 

@@ -40,4 +40,3 @@ pub mod service;
 mod statistics;
 #[cfg(feature = "torch")]
 pub mod trainer;
-

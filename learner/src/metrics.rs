@@ -40,7 +40,8 @@ impl LearnerMetrics {
     pub(crate) fn new(registry: &Registry) -> Self {
         const PROVEN: &str = "the learner's metrics are registered once a registry, under names of their own";
         let counter = |name: &str, help: &str| {
-            register_int_counter_with_registry!(format!("getup_learner_{name}"), help, registry).expect(PROVEN)
+            register_int_counter_with_registry!(format!("getup_learner_{name}"), help, registry)
+                .expect(PROVEN)
         };
         let whole = |name: &str, help: &str| {
             register_int_gauge_with_registry!(format!("getup_learner_{name}"), help, registry).expect(PROVEN)
@@ -56,7 +57,10 @@ impl LearnerMetrics {
         Self {
             updates: counter("updates_total", "Updates of the networks since this process started."),
             env_steps: whole("env_steps", "Env steps of the run that have reached the replay."),
-            update_seconds: seconds("update_seconds", "Time of one update, without waiting for its minibatch."),
+            update_seconds: seconds(
+                "update_seconds",
+                "Time of one update, without waiting for its minibatch.",
+            ),
             wait_seconds: seconds("wait_seconds", "Time waited for a minibatch."),
             critic_loss: gauge("critic_loss", "Mean squared error of the critics, summed over them."),
             actor_loss: gauge("actor_loss", "Mean of temperature times log-probability less Q."),
@@ -66,10 +70,16 @@ impl LearnerMetrics {
             beta: gauge("beta", "Torque-limit multiplier of the stage."),
             stage: whole("stage", "Stage of the curriculum, from 0."),
             stage_env_steps: whole("stage_env_steps", "Env steps spent in the stage, N_i."),
-            stage_limit_env_steps: whole("stage_limit_env_steps", "Env steps the stage may last, M_i; 0 for none."),
+            stage_limit_env_steps: whole(
+                "stage_limit_env_steps",
+                "Env steps the stage may last, M_i; 0 for none.",
+            ),
             policy_version: whole("policy_version", "Counter of the newest policy that was broadcast."),
             evaluations: counter("evaluations_total", "Evaluations reported since this process started."),
-            evaluations_outstanding: whole("evaluations_outstanding", "Evaluations offered and not yet reported."),
+            evaluations_outstanding: whole(
+                "evaluations_outstanding",
+                "Evaluations offered and not yet reported.",
+            ),
             evaluation_return_mean: gauge("evaluation_return_mean", "Mean return of the newest evaluation."),
             evaluation_return_min: gauge("evaluation_return_min", "Minimum return of the newest evaluation."),
             promotions: counter("promotions_total", "Stages passed since this process started."),

@@ -150,9 +150,11 @@ mod tests {
     fn the_probability_of_all_actions_is_one_for_every_beta() {
         // ∫ π(a) da over (−β̂, β̂), by the midpoint rule; the density is evaluated through the same change of
         // variables that an update uses.
-        for (mean, log_std, beta) in [(0.0, -1.0, 1.0), (0.8, -2.0, 0.4), (-1.2, 0.0, 0.7), (0.3, -0.5, 1.6)] {
+        for (mean, log_std, beta) in [(0.0, -1.0, 1.0), (0.8, -2.0, 0.4), (-1.2, 0.0, 0.7), (0.3, -0.5, 1.6)]
+        {
             let cells = 200_000;
-            let action: Vec<f64> = (0..cells).map(|i| beta * (2.0 * (i as f64 + 0.5) / cells as f64 - 1.0)).collect();
+            let action: Vec<f64> =
+                (0..cells).map(|i| beta * (2.0 * (i as f64 + 0.5) / cells as f64 - 1.0)).collect();
             let u: Vec<f32> = action.iter().map(|a| (a / beta).atanh() as f32).collect();
             let noise: Vec<f32> = u.iter().map(|u| (u - mean as f32) / (log_std as f32).exp()).collect();
             let constant = |value: f64| Tensor::full([cells, 1], value, (Kind::Float, Device::Cpu));

@@ -96,7 +96,8 @@ impl RunFolder {
         let path = self.root.join("incarnation");
         let last = match fs::read_to_string(&path) {
             Ok(text) => text.trim().parse::<u64>().map_err(|error| {
-                let source = io::Error::new(io::ErrorKind::InvalidData, format!("{text:?} is no count: {error}"));
+                let source =
+                    io::Error::new(io::ErrorKind::InvalidData, format!("{text:?} is no count: {error}"));
                 fault("read", &path)(source)
             })?,
             Err(error) if error.kind() == io::ErrorKind::NotFound => 0,

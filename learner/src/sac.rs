@@ -60,7 +60,9 @@ pub struct Losses {
 /// A loss that is not a number any more. The networks are those of before the update that found it, or differ
 /// from them by finite steps: the last checkpoint is good.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error("the {name} loss is {value} at update {update}; lower its learning rate, or resume the last checkpoint")]
+#[error(
+    "the {name} loss is {value} at update {update}; lower its learning rate, or resume the last checkpoint"
+)]
 pub struct NonFiniteLoss {
     /// Which loss.
     pub name: &'static str,

@@ -5,10 +5,10 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Instant;
 
+use futures::{Stream, StreamExt};
 use getup_proto::v1::learner_server::{Learner, LearnerServer};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, v1};
 use getup_telemetry::Shutdown;
-use futures::{Stream, StreamExt};
 use tokio_stream::wrappers::WatchStream;
 use tonic::{Request, Response, Status};
 
@@ -31,7 +31,9 @@ impl From<HubError> for Status {
     fn from(error: HubError) -> Self {
         let message = error.to_string();
         match error {
-            HubError::Spec(_) | HubError::Lease(LeaseError::NotHeld(_)) => Status::failed_precondition(message),
+            HubError::Spec(_) | HubError::Lease(LeaseError::NotHeld(_)) => {
+                Status::failed_precondition(message)
+            }
             HubError::Lease(LeaseError::Episodes { .. }) | HubError::Malformed(_) => {
                 Status::invalid_argument(message)
             }
@@ -68,7 +70,10 @@ impl Learner for Service {
         Ok(Response::new(self.hub.heartbeat(request.into_inner(), Instant::now())?))
     }
 
-    async fn report(&self, request: Request<v1::EvaluationReport>) -> Result<Response<v1::ReportReply>, Status> {
+    async fn report(
+        &self,
+        request: Request<v1::EvaluationReport>,
+    ) -> Result<Response<v1::ReportReply>, Status> {
         self.hub.report(request.into_inner())?;
         Ok(Response::new(v1::ReportReply {}))
     }

@@ -57,7 +57,9 @@ pub enum TrainError {
     #[error("cannot sample from the replay: {0}")]
     Sample(#[from] SampleError),
     /// A minibatch lacks a column.
-    #[error("the replay's minibatches have no column {0:?}: do replay and learner run the same configuration?")]
+    #[error(
+        "the replay's minibatches have no column {0:?}: do replay and learner run the same configuration?"
+    )]
     Column(&'static str),
 }
 
@@ -166,7 +168,7 @@ impl Trainer {
             checkpoints: Checkpoints::new(folder.checkpoints(), &config.learner, metrics.clone()),
             pace: Pace::new(sac.updates()),
             version: PolicyVersion { incarnation, counter: 0 },
-            ending: curriculum.outcome().map(Ending::Curriculum),
+            ending: curriculum.outcome().map(Ending::Curriculum).or(already_past(&config, &progress)),
             evaluation: None,
             evaluated_updates: 0,
             config,
@@ -196,7 +198,11 @@ impl Trainer {
 
     /// Trains on minibatches of `source` until the curriculum's end, the last env step, or `shutdown`, and leaves
     /// a checkpoint.
-    pub fn run(&mut self, source: &mut dyn MinibatchSource, shutdown: &Shutdown) -> Result<Ending, TrainError> {
+    pub fn run(
+        &mut self,
+        source: &mut dyn MinibatchSource,
+        shutdown: &Shutdown,
+    ) -> Result<Ending, TrainError> {
         while self.ending.is_none() && !shutdown.is_triggered() {
             let asked = Instant::now();
             match source.poll(STARVED) {
@@ -288,7 +294,11 @@ impl Trainer {
         Ok(())
     }
 
-    fn evaluated(&mut self, evaluation: &Evaluation, episodes: &[v1::EpisodeResult]) -> Result<(), TrainError> {
+    fn evaluated(
+        &mut self,
+        evaluation: &Evaluation,
+        episodes: &[v1::EpisodeResult],
+    ) -> Result<(), TrainError> {
         let policy = &evaluation.policy;
         let returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
         let mean = returns.iter().sum::<f64>() / returns.len() as f64;
@@ -314,7 +324,14 @@ impl Trainer {
             updates_per_second: self.pace.per_second(),
         };
         append_line(&self.folder.timings(), &timing)?;
-        tracing::info!(env_steps = policy.env_steps, updates = evaluation.updates, beta, mean, min, "evaluation");
+        tracing::info!(
+            env_steps = policy.env_steps,
+            updates = evaluation.updates,
+            beta,
+            mean,
+            min,
+            "evaluation"
+        );
         self.metrics.evaluations.inc();
         self.metrics.evaluation_return_mean.set(mean);
         self.metrics.evaluation_return_min.set(min);
@@ -456,6 +473,11 @@ impl Trainer {
             evaluation: self.evaluation,
         });
     }
+}
+
+/// A resumed run may have made its steps already.
+fn already_past(config: &TrainerConfig, progress: &Progress) -> Option<Ending> {
+    config.steps.filter(|steps| progress.env_steps >= *steps).map(|_| Ending::Steps(progress.env_steps))
 }
 
 impl Progress {

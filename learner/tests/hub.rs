@@ -35,12 +35,12 @@ fn policy(counter: u64) -> Arc<v1::PolicyUpdate> {
 }
 
 /// An actor's way to the hub.
-#[allow(clippy::large_enum_variant)]
 enum Door {
     Here(Arc<Hub>),
     Grpc(LearnerClient<Channel>),
 }
 
+#[allow(clippy::large_enum_variant)] // One a test.
 enum Policies {
     Here(watch::Receiver<Arc<v1::PolicyUpdate>>),
     Grpc(Streaming<v1::PolicyUpdate>),
@@ -69,8 +69,14 @@ impl Door {
         }
     }
 
-    async fn heartbeat(&self, actor: &str, lease: u64, idle: bool) -> Result<Option<v1::EvaluationLease>, Status> {
-        let request = v1::HeartbeatRequest { actor: actor.into(), lease, idle, ..v1::HeartbeatRequest::default() };
+    async fn heartbeat(
+        &self,
+        actor: &str,
+        lease: u64,
+        idle: bool,
+    ) -> Result<Option<v1::EvaluationLease>, Status> {
+        let request =
+            v1::HeartbeatRequest { actor: actor.into(), lease, idle, ..v1::HeartbeatRequest::default() };
         Ok(match self {
             Door::Here(hub) => hub.heartbeat(request, Instant::now())?.lease,
             Door::Grpc(client) => client.clone().heartbeat(request).await?.into_inner().lease,
@@ -149,7 +155,11 @@ async fn an_evaluation_is_leased_kept_alive_and_reported_once() {
         assert_eq!(code(door.report(lease.id, &[1.0]).await), Code::InvalidArgument);
         assert_eq!(code(door.report(lease.id, &[1.0, f64::NAN]).await), Code::InvalidArgument);
         assert_eq!(code(door.report(lease.id + 1, &[1.0, 2.0]).await), Code::FailedPrecondition);
-        assert_eq!(code(door.report(1, &[1.0, 2.0]).await), Code::FailedPrecondition, "of an earlier learner");
+        assert_eq!(
+            code(door.report(1, &[1.0, 2.0]).await),
+            Code::FailedPrecondition,
+            "of an earlier learner"
+        );
         assert_eq!(hub.outstanding(), 1, "what is refused changes nothing");
         door.report(lease.id, &[1.0, 2.0]).await.unwrap();
         assert_eq!(code(door.report(lease.id, &[1.0, 2.0]).await), Code::FailedPrecondition);

@@ -11,7 +11,7 @@
 //! `reward + discount × V(next)` whatever n is. The sum runs over neighbouring segments of the episode.
 
 use crate::minibatch::{MinibatchColumn, SampleOptions};
-use crate::ring::{LayoutColumn, Ring, Row};
+use crate::ring::{Entry, LayoutColumn, Ring, Row};
 use crate::sampler::Sampler;
 use getup_proto::{Rows, columns};
 use std::ops::Range;
@@ -57,32 +57,54 @@ pub(crate) fn gather(ring: &Ring, sampler: &mut Sampler, options: &SampleOptions
 
 /// Follows up to `n` steps of the episode from the row `begin`; `reward` is the place of the reward in a row.
 fn span(ring: &Ring, begin: Row, reward: Option<usize>, n: usize, gamma: f32) -> Transition {
-    let mut entry = ring.entry_of(begin);
-    let begin_slot = ring.slot(begin);
-    let mut slot = begin_slot;
-    let mut steps_left = entry.steps_after(begin);
-    let mut transition = Transition { begin: begin_slot, end: begin_slot, reward: 0.0, discount: 1.0 };
-    for step in 1..=n {
-        if let Some(place) = reward {
-            transition.reward += transition.discount * ring.values(slot)[place];
-        }
-        transition.discount *= gamma;
-        slot = ring.slot_after(slot);
-        transition.end = slot;
-        steps_left -= 1;
-        if steps_left > 0 || step == n {
-            continue;
-        }
-        // The row where a segment ends is the one where its continuation begins.
-        let Some(continuation) = ring.continuation(entry) else { break };
-        entry = continuation;
-        slot = ring.slot(entry.first_row);
-        steps_left = entry.steps;
-    }
-    if steps_left == 0 && entry.terminal {
-        transition.discount = 0.0;
+    let slot = ring.slot(begin);
+    let mut transition = Transition { begin: slot, end: slot, reward: 0.0, discount: 1.0 };
+    let steps = ring.steps_from(slot);
+    transition.follow(ring, steps.min(n), reward, gamma);
+    if n >= steps {
+        transition.cross_segments(ring, ring.entry_of(begin), n - steps, reward, gamma);
     }
     transition
+}
+
+impl Transition {
+    /// Goes on by so many steps, all within one segment.
+    fn follow(&mut self, ring: &Ring, steps: usize, reward: Option<usize>, gamma: f32) {
+        for _ in 0..steps {
+            if let Some(place) = reward {
+                self.reward += self.discount * ring.values(self.end)[place];
+            }
+            self.discount *= gamma;
+            self.end = ring.slot_after(self.end);
+        }
+    }
+
+    /// Goes on by up to `left` steps from the end of the segment `entry`.
+    fn cross_segments<'a>(
+        &mut self,
+        ring: &'a Ring,
+        mut entry: &'a Entry,
+        mut left: usize,
+        reward: Option<usize>,
+        gamma: f32,
+    ) {
+        // The row where a segment ends is the one where its continuation begins.
+        while left > 0
+            && let Some(continuation) = ring.continuation(entry)
+        {
+            entry = continuation;
+            self.end = ring.slot(entry.first_row);
+            let steps = entry.steps.min(left);
+            self.follow(ring, steps, reward, gamma);
+            left -= steps;
+            if steps < entry.steps {
+                return;
+            }
+        }
+        if entry.terminal {
+            self.discount = 0.0;
+        }
+    }
 }
 
 fn copy(ring: &Ring, name: String, at: &Range<usize>, slots: impl Iterator<Item = usize>) -> MinibatchColumn {

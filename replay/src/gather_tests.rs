@@ -31,6 +31,14 @@ fn reference(lane: u32, t: usize, n: usize, held: usize, terminal: bool) -> (f32
     (total as f32, discount as f32, end)
 }
 
+fn reward_place(ring: &Ring) -> usize {
+    ring.layout().columns[2].at.start
+}
+
+fn observation(ring: &Ring, slot: usize) -> f32 {
+    ring.values(slot)[ring.layout().columns[0].at.start]
+}
+
 proptest! {
     #[test]
     fn n_step_transitions_equal_a_straightforward_reference(
@@ -48,16 +56,16 @@ proptest! {
         }
         for (number, (lane, t)) in (0..).zip(steps) {
             let row = ring.nth_row(number);
-            if !ring.begins_transition(row) {
+            if ring.steps_from(ring.slot(row)) == 0 {
                 continue;
             }
             let (length, ending) = lengths[lane as usize];
-            let got = span(&ring, row, Some(5), n, GAMMA);
+            let got = span(&ring, row, Some(reward_place(&ring)), n, GAMMA);
             let (reward, discount, end) = reference(lane, t, n, length, ending == Ending::Terminal);
             prop_assert!((got.reward - reward).abs() < 1e-5);
             prop_assert!((got.discount - discount).abs() < 1e-6);
-            prop_assert_eq!(ring.values(got.begin)[0], fixtures::value(1, lane, 0, t, 0, 0));
-            prop_assert_eq!(ring.values(got.end)[0], fixtures::value(1, lane, 0, end, 0, 0));
+            prop_assert_eq!(observation(&ring, got.begin), fixtures::value(1, lane, 0, t, 0, 0));
+            prop_assert_eq!(observation(&ring, got.end), fixtures::value(1, lane, 0, end, 0, 0));
         }
     }
 }
@@ -68,14 +76,14 @@ fn a_transition_is_shorter_while_the_next_segment_has_not_come_and_whole_once_it
     let mut ring = Ring::new(&fixtures::spec(8), 100);
     ring.push(&segments[0]);
     let row = ring.nth_row(6);
-    let short = span(&ring, row, Some(5), 4, GAMMA);
+    let short = span(&ring, row, Some(reward_place(&ring)), 4, GAMMA);
     assert_eq!(
-        (short.discount, ring.values(short.end)[0]),
+        (short.discount, observation(&ring, short.end)),
         (GAMMA * GAMMA, fixtures::value(1, 0, 0, 8, 0, 0))
     );
     ring.push(&segments[1]);
-    let whole = span(&ring, row, Some(5), 4, GAMMA);
-    assert_eq!(ring.values(whole.end)[0], fixtures::value(1, 0, 0, 10, 0, 0));
+    let whole = span(&ring, row, Some(reward_place(&ring)), 4, GAMMA);
+    assert_eq!(observation(&ring, whole.end), fixtures::value(1, 0, 0, 10, 0, 0));
 }
 
 #[test]

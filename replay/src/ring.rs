@@ -3,13 +3,15 @@
 //! A segment of T steps takes T + 1 rows. A row holds, side by side, everything that belongs to one step: the
 //! observation before it, its action, its reward, and the episode's β̂; the last row holds the final observation
 //! alone. So a transition is two neighbouring rows, no next state is stored twice, and sampling one touches one
-//! place in memory. Rows are numbered from the first ever pushed and lie in a buffer that wraps around.
+//! place in memory. In front of each row stands how many steps follow it in its segment, which is all that most
+//! samples need to know of the segment. Rows are numbered from the first ever pushed and lie in a buffer that wraps
+//! around.
 //!
 //! The oldest segments leave, whole, when a new one would exceed the capacity. What is in the ring is therefore a
 //! function of the segments pushed most recently, however many were pushed before: a ring that is rebuilt from
 //! the log equals the one that was lost.
 
-use getup_proto::{Rows, RunSpec, Segment, columns};
+use getup_proto::{ColumnSpec, Rows, RunSpec, Segment, columns};
 use std::collections::{HashMap, VecDeque};
 use std::ops::Range;
 
@@ -35,13 +37,15 @@ pub(crate) struct Ring {
     transitions: usize,
     /// Row after row.
     values: Vec<f32>,
-    /// The segment that each row belongs to, by the low bits of its number.
-    owners: Vec<u32>,
+    /// Rows that `values` has room for.
+    slots: usize,
     segments: VecDeque<Entry>,
     /// Number of the oldest segment.
     first_segment: u64,
     /// Numbers of the rows in the ring.
     live: Range<u64>,
+    /// Slot of the oldest row.
+    first_slot: usize,
     /// The newest segment of each episode that may go on.
     unfinished: HashMap<Lane, u64>,
 }
@@ -51,7 +55,7 @@ pub(crate) struct Ring {
 pub(crate) struct Layout {
     /// In the spec's order.
     pub(crate) columns: Vec<LayoutColumn>,
-    /// Values a row.
+    /// Values a row, the number of steps that follow it included.
     stride: usize,
 }
 
@@ -70,7 +74,7 @@ type Lane = (u64, u32);
 #[derive(Clone, Debug)]
 pub(crate) struct Entry {
     pub(crate) first_row: Row,
-    pub(crate) steps: u64,
+    pub(crate) steps: usize,
     pub(crate) terminal: bool,
     /// Number of the segment that continues the episode.
     continued_by: Option<u64>,
@@ -86,16 +90,17 @@ impl Ring {
         let layout = Layout::new(spec);
         // One row more a segment: enough where segments have 8 steps on average. Below that rows run out before
         // transitions do, and the ring holds somewhat fewer.
-        let rows = capacity + capacity / 8 + spec.max_segment_steps + 1;
+        let slots = capacity + capacity / 8 + spec.max_segment_steps + 1;
         Self {
-            values: vec![0.0; rows * layout.stride],
-            owners: vec![0; rows],
+            values: vec![0.0; slots * layout.stride],
+            slots,
             layout,
             capacity,
             transitions: 0,
             segments: VecDeque::new(),
             first_segment: 0,
             live: 0..0,
+            first_slot: 0,
             unfinished: HashMap::new(),
         }
     }
@@ -103,20 +108,18 @@ impl Ring {
     /// Adds a segment that follows the ring's spec, and drops the oldest ones to make room.
     pub(crate) fn push(&mut self, segment: &Segment) {
         let rows = segment.steps as u64 + 1;
-        while self.transitions + segment.steps > self.capacity
-            || self.live.end - self.live.start + rows > self.owners.len() as u64
-        {
+        while self.transitions + segment.steps > self.capacity || self.rows() + rows > self.slots as u64 {
             self.evict();
         }
         let number = self.first_segment + self.segments.len() as u64;
         let first_row = Row(self.live.end);
         self.live.end += rows;
-        self.write_rows(first_row, number, segment);
+        self.write_rows(first_row, segment);
         self.link(number, segment);
         self.transitions += segment.steps;
         self.segments.push_back(Entry {
             first_row,
-            steps: segment.steps as u64,
+            steps: segment.steps,
             terminal: segment.terminal,
             continued_by: None,
             lane: (segment.writer, segment.lane),
@@ -137,7 +140,7 @@ impl Ring {
 
     /// Bytes that a full ring takes.
     pub(crate) fn memory_bytes(&self) -> usize {
-        size_of_val(self.values.as_slice()) + size_of_val(self.owners.as_slice())
+        size_of_val(self.values.as_slice())
     }
 
     pub(crate) fn layout(&self) -> &Layout {
@@ -149,15 +152,14 @@ impl Ring {
         Row(self.live.start + n)
     }
 
-    /// Whether a transition begins at the row: all but the last of a segment.
-    pub(crate) fn begins_transition(&self, row: Row) -> bool {
-        self.entry_of(row).steps_after(row) > 0
+    /// Steps of the row's segment from the row in `slot` on; a transition begins where there are some.
+    pub(crate) fn steps_from(&self, slot: usize) -> usize {
+        self.values[slot * self.layout.stride] as usize
     }
 
     /// The segment that a row belongs to.
     pub(crate) fn entry_of(&self, row: Row) -> &Entry {
-        let oldest = self.first_segment as u32;
-        &self.segments[self.owners[self.slot(row)].wrapping_sub(oldest) as usize]
+        &self.segments[self.segments.partition_point(|entry| entry.first_row.0 <= row.0) - 1]
     }
 
     /// The segment that continues the episode, where it is there.
@@ -167,12 +169,13 @@ impl Ring {
 
     /// Where in the buffer a row lies.
     pub(crate) fn slot(&self, row: Row) -> usize {
-        (row.0 % self.owners.len() as u64) as usize
+        let slot = self.first_slot + (row.0 - self.live.start) as usize;
+        if slot < self.slots { slot } else { slot - self.slots }
     }
 
     /// The slot of the row after the one in `slot`.
     pub(crate) fn slot_after(&self, slot: usize) -> usize {
-        if slot + 1 == self.owners.len() { 0 } else { slot + 1 }
+        if slot + 1 == self.slots { 0 } else { slot + 1 }
     }
 
     /// The values of the row in `slot`.
@@ -182,20 +185,22 @@ impl Ring {
 
     fn evict(&mut self) {
         let entry = self.segments.pop_front().expect("a ring has room for its longest segment");
-        self.transitions -= entry.steps as usize;
-        self.live.start += entry.steps + 1;
+        self.transitions -= entry.steps;
+        self.live.start += entry.steps as u64 + 1;
+        self.first_slot = (self.first_slot + entry.steps + 1) % self.slots;
         if self.unfinished.get(&entry.lane) == Some(&self.first_segment) {
             self.unfinished.remove(&entry.lane);
         }
         self.first_segment += 1;
     }
 
-    fn write_rows(&mut self, first_row: Row, number: u64, segment: &Segment) {
+    fn write_rows(&mut self, first_row: Row, segment: &Segment) {
         let stride = self.layout.stride;
         let mut slot = self.slot(first_row);
         for step in 0..=segment.steps {
-            self.owners[slot] = number as u32;
             let row = &mut self.values[slot * stride..][..stride];
+            // A segment has at most 2^16 steps: exact.
+            row[0] = (segment.steps - step) as f32;
             for (column, bytes) in self.layout.columns.iter().zip(&segment.columns) {
                 let from = match column.rows {
                     Rows::Once => 0,
@@ -225,25 +230,22 @@ impl Ring {
     }
 }
 
-impl Entry {
-    /// Steps of the segment from `row` on, which is one of its rows.
-    pub(crate) fn steps_after(&self, row: Row) -> u64 {
-        self.first_row.0 + self.steps - row.0
-    }
-}
-
 impl Layout {
     fn new(spec: &RunSpec) -> Self {
-        let mut stride = 0;
-        let columns = spec
-            .columns
-            .iter()
-            .map(|column| {
-                let at = stride..stride + column.width;
-                stride = at.end;
-                LayoutColumn { name: column.name.clone(), rows: column.rows, at }
-            })
-            .collect();
+        let place = |column: &ColumnSpec| LayoutColumn {
+            name: column.name.clone(),
+            rows: column.rows,
+            at: 0..column.width,
+        };
+        let mut columns: Vec<LayoutColumn> = spec.columns.iter().map(place).collect();
+        // Narrow columns first: the reward lies beside the number of steps, on the same cache line.
+        let mut by_width: Vec<&mut LayoutColumn> = columns.iter_mut().collect();
+        by_width.sort_by_key(|column| column.at.len());
+        let mut stride = 1;
+        for column in by_width {
+            column.at = stride..stride + column.at.len();
+            stride = column.at.end;
+        }
         Self { columns, stride }
     }
 }

@@ -7,7 +7,7 @@ fn contents(ring: &Ring) -> Vec<(Vec<f32>, bool)> {
     (0..ring.rows())
         .map(|n| ring.nth_row(n))
         .map(|row| {
-            let begins = ring.begins_transition(row);
+            let begins = ring.steps_from(ring.slot(row)) > 0;
             let values = ring.values(ring.slot(row));
             let kept = ring.layout.columns.iter().filter(|column| begins || column.rows != Rows::Steps);
             (kept.flat_map(|column| values[column.at.clone()].to_vec()).collect(), begins)
@@ -60,7 +60,7 @@ proptest! {
         if kept < segments.len() {
             let one_more = segments[segments.len() - kept - 1].steps;
             let full = ring.len() + one_more > capacity
-                || ring.rows() as usize + one_more + 1 > ring.owners.len();
+                || ring.rows() as usize + one_more + 1 > ring.slots;
             prop_assert!(full);
         }
     }

@@ -30,7 +30,7 @@ impl Sampler {
             Self::Uniform(rng) => loop {
                 // Rows are uniform, and so are those of them that begin a transition: all but one a segment.
                 let row = ring.nth_row(rng.random_range(0..ring.rows()));
-                if ring.begins_transition(row) {
+                if ring.steps_from(ring.slot(row)) > 0 {
                     return row;
                 }
             },
@@ -63,7 +63,7 @@ mod tests {
         for _ in 0..200_000 {
             counts[(sampler.draw(&ring).number() - ring.nth_row(0).number()) as usize] += 1;
         }
-        let begins = |i: &usize| ring.begins_transition(ring.nth_row(*i as u64));
+        let begins = |i: &usize| ring.steps_from(ring.slot(ring.nth_row(*i as u64))) > 0;
         let drawn: Vec<u32> = (0..counts.len()).filter(begins).map(|i| counts[i]).collect();
         assert_eq!(drawn.len(), ring.len());
         assert_eq!(drawn.iter().sum::<u32>(), 200_000);

@@ -245,19 +245,19 @@ fn shutdown_acknowledges_what_came_tells_clients_and_takes_little_time() {
     let mut writer = replay.writer(1);
     let idle = replay.writer(2);
     let store = replay.store.clone();
-    let reading = replay.runtime.block_on(async {
+    replay.runtime.block_on(async {
         for sequence in 1..=20 {
             writer.send(&segment(&replay.spec, 1, sequence, 8)).await.unwrap();
         }
-        tokio::spawn(async move {
-            let mut durable = 0;
-            loop {
-                match next(&mut writer.replies).await {
-                    Ok(sequence) => durable = sequence,
-                    Err(status) => return (durable, status),
-                }
+    });
+    let reading = replay.runtime.spawn(async move {
+        let mut durable = 0;
+        loop {
+            match next(&mut writer.replies).await {
+                Ok(sequence) => durable = sequence,
+                Err(status) => return (durable, status),
             }
-        })
+        }
     });
     let runtime = replay.runtime.handle().clone();
     std::thread::sleep(Duration::from_millis(20));

@@ -4,7 +4,7 @@
 //!
 //! * [`Character`]: which body; its MJCF is embedded in the binary.
 //! * [`World`]: one model and its state, with no task on top.
-//! * [`tolerance`]: the reward's one building block.
+//! * [`tolerance()`]: the reward's one building block.
 //! * [`Task`] and [`GetUp`]: what is observed, what is paid, how episodes begin ([`Resets`]) and end.
 //! * [`Lane`]: one world playing episodes of one task.
 //! * [`falls`] and [`rollout`]: the files behind `getup falls` and `getup rollout`.

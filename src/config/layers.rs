@@ -35,7 +35,11 @@ impl Layers {
     pub(crate) fn preset(&mut self, name: &str) -> Result<()> {
         let Some((_, text)) = PRESETS.iter().find(|(preset, _)| *preset == name) else {
             let names = PRESETS.map(|(preset, _)| preset);
-            bail!("no preset {name:?}{}; there are {}", nearest(name, names.iter().copied()), names.join(", "));
+            bail!(
+                "no preset {name:?}{}; there are {}",
+                nearest(name, names.iter().copied()),
+                names.join(", ")
+            );
         };
         self.overlay(&format!("preset {name}"), text.parse().context("a preset is not TOML")?)?;
         self.merged.insert("preset".into(), name.into());
@@ -52,7 +56,9 @@ impl Layers {
     /// Variables such as `GETUP_SAC__BATCH=256`.
     pub(crate) fn environment(&mut self, variables: impl Iterator<Item = (String, String)>) -> Result<()> {
         let mut settings: Vec<(String, String)> = variables
-            .filter(|(name, _)| name.starts_with("GETUP_") && !NOT_SETTINGS.iter().any(|other| name.starts_with(other)))
+            .filter(|(name, _)| {
+                name.starts_with("GETUP_") && !NOT_SETTINGS.iter().any(|other| name.starts_with(other))
+            })
             .collect();
         settings.sort();
         for (name, value) in settings {
@@ -68,7 +74,8 @@ impl Layers {
             bail!("{source}: {assignment:?} is not of the form KEY=VALUE, such as sac.batch=256");
         };
         let (key, text) = (key.trim(), text.trim());
-        let as_toml = format!("value = {text}").parse::<Table>().ok().and_then(|mut table| table.remove("value"));
+        let as_toml =
+            format!("value = {text}").parse::<Table>().ok().and_then(|mut table| table.remove("value"));
         let as_text = Value::String(text.to_owned());
         let mut first_error = None;
         for value in as_toml.into_iter().chain([as_text]) {
@@ -81,7 +88,8 @@ impl Layers {
                 }
             }
         }
-        Err(first_error.expect("text is always tried")).with_context(|| format!("cannot set {key} to {text:?}"))
+        Err(first_error.expect("text is always tried"))
+            .with_context(|| format!("cannot set {key} to {text:?}"))
     }
 
     /// The configuration, valid.
@@ -92,7 +100,9 @@ impl Layers {
     }
 
     fn parse(&self) -> Result<Config> {
-        Value::Table(self.merged.clone()).try_into().map_err(|error: toml::de::Error| anyhow!("{}", error.to_string().trim()))
+        Value::Table(self.merged.clone())
+            .try_into()
+            .map_err(|error: toml::de::Error| anyhow!("{}", error.to_string().trim()))
     }
 }
 
@@ -157,7 +167,8 @@ fn leaves(prefix: &str, table: &Table, names: &mut Vec<String>) {
 
 /// "; did you mean …?" where a name is near.
 fn nearest<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> String {
-    let near = known.map(|known| (strsim::jaro_winkler(name, known), known)).max_by(|a, b| a.0.total_cmp(&b.0));
+    let near =
+        known.map(|known| (strsim::jaro_winkler(name, known), known)).max_by(|a, b| a.0.total_cmp(&b.0));
     match near {
         Some((similarity, known)) if similarity > 0.8 => format!("; did you mean {known}?"),
         _ => String::new(),

@@ -118,7 +118,8 @@ impl Turns {
             let reply = self.hub.heartbeat(beat.into(), Instant::now())?;
             let Some(lease) = reply.lease.map(Lease::parse).transpose()? else { return Ok(()) };
             let on = |_| ControlFlow::Continue(());
-            let episodes = self.evaluator.evaluate(&lease.update.policy, lease.update.beta, &lease.seeds, on)?;
+            let episodes =
+                self.evaluator.evaluate(&lease.update.policy, lease.update.beta, &lease.seeds, on)?;
             let episodes = episodes.iter().map(|episode| episode.result().into()).collect();
             self.hub.report(v1::EvaluationReport { lease: lease.id, actor: self.name.clone(), episodes })?;
             self.trainer.take_reports()?;

@@ -52,11 +52,8 @@ enum Command {
 fn main() -> Result<()> {
     match Cli::parse().command {
         Command::Setup { peers, cuda } => {
-            native::set_up()?;
+            native::set_up(cuda)?;
             prerequisites::install_debian_packages()?;
-            if cuda {
-                native::set_up_cuda()?;
-            }
             if peers {
                 native::set_up_peers()?;
             }
@@ -64,20 +61,20 @@ fn main() -> Result<()> {
             Ok(())
         }
         Command::Train { args } => {
-            native::set_up()?;
+            native::set_up(false)?;
             tasks::train(&args)
         }
         Command::Test { full } => {
-            native::set_up()?;
+            native::set_up(false)?;
             prerequisites::install_debian_packages()?;
             tasks::test(full)
         }
         Command::Check => {
-            native::set_up()?;
+            native::set_up(false)?;
             tasks::check()
         }
         Command::Bench { name } => {
-            native::set_up()?;
+            native::set_up(false)?;
             tasks::bench(&name)
         }
     }

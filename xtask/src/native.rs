@@ -15,14 +15,24 @@ use crate::prerequisites;
 /// MuJoCo's version, as in the name of its library.
 const MUJOCO: &str = "3.17.0";
 /// What every build needs.
-const WHEELS: &[&str] = &[
-    "mujoco==3.17.0",
-    "torch==2.11.0",
-    "nvidia-cuda-runtime==13.0.96",
-    "nvidia-cuda-cupti==13.0.85",
+const WHEELS: &[&str] =
+    &["mujoco==3.17.0", "torch==2.11.0", "nvidia-cuda-runtime==13.0.96", "nvidia-cuda-cupti==13.0.85"];
+/// What `libtorch_cuda.so` of that torch needs beside them; it looks for them in the same folder.
+const CUDA_WHEELS: &[&str] = &[
+    "nvidia-cublas==13.1.0.3",
+    "nvidia-cuda-nvrtc==13.0.88",
+    "nvidia-cudnn-cu13==9.19.0.56",
+    "nvidia-cufft==12.0.0.61",
+    "nvidia-cufile==1.15.1.6",
+    "nvidia-curand==10.4.0.35",
+    "nvidia-cusolver==12.0.4.66",
+    "nvidia-cusparse==12.6.3.3",
+    "nvidia-cusparselt-cu13==0.8.0",
+    "nvidia-nccl-cu13==2.28.9",
+    "nvidia-nvjitlink==13.0.88",
+    "nvidia-nvshmem-cu13==3.4.5",
+    "nvidia-nvtx==13.0.85",
 ];
-/// What `libtorch_cuda.so` of that torch needs, on a machine with an NVIDIA driver.
-const CUDA_REQUIREMENTS: &[&str] = &["torch==2.11.0"];
 /// What benchmarks compare with: PyTorch whole, with NumPy for its tensors.
 const PEER_REQUIREMENTS: &[&str] = &["torch==2.11.0", "numpy==2.3.5"];
 
@@ -40,18 +50,18 @@ pub(crate) fn peers_python() -> PathBuf {
     native().join("peers/bin/python")
 }
 
-/// Installs the wheels and writes `.cargo/native.toml`, where they are missing or of other versions.
-pub(crate) fn set_up() -> Result<()> {
-    install_into(&native().join("wheels"), WHEELS, true, "MuJoCo and libtorch (1.3 GB)")?;
+/// Installs the wheels and writes `.cargo/native.toml`, where they are missing or of other versions. Without `cuda`
+/// an installation with CUDA's libraries is left as it is.
+pub(crate) fn set_up(cuda: bool) -> Result<()> {
+    let with_cuda = [WHEELS, CUDA_WHEELS].concat();
+    let installed = fs::read_to_string(native().join("wheels/installed")).unwrap_or_default();
+    let has_cuda = installed == with_cuda.join("\n");
+    if !has_cuda && cuda {
+        install_wheels(&with_cuda, "MuJoCo and libtorch with CUDA (about 4 GB)")?;
+    } else if !has_cuda && installed != WHEELS.join("\n") {
+        install_wheels(WHEELS, "MuJoCo and libtorch (1.3 GB)")?;
+    }
     link_mujoco()?;
-    write_cargo_settings()
-}
-
-/// Installs the CUDA libraries beside the others.
-pub(crate) fn set_up_cuda() -> Result<()> {
-    let requirements: Vec<String> = nvidia_requirements(CUDA_REQUIREMENTS)?;
-    let names: Vec<&str> = requirements.iter().map(String::as_str).collect();
-    install_into(&native().join("cuda"), &names, true, "CUDA libraries (about 4 GB)")?;
     write_cargo_settings()
 }
 
@@ -69,30 +79,24 @@ pub(crate) fn set_up_peers() -> Result<()> {
     fs::write(stamp, wanted).context("cannot note the peers' versions")
 }
 
-/// Installs `requirements` into `folder`, whole or not at all.
-fn install_into(folder: &Path, requirements: &[&str], no_deps: bool, what: &str) -> Result<()> {
-    let stamp = folder.join("installed");
-    let wanted = requirements.join("\n");
-    if fs::read_to_string(&stamp).is_ok_and(|installed| installed == wanted) {
-        return Ok(());
-    }
+/// Installs wheels without their dependencies, all or none.
+fn install_wheels(wheels: &[&str], what: &str) -> Result<()> {
     prerequisites::check()?;
+    let folder = native().join("wheels");
     println!("Installing {what} into {}", folder.display());
     let pip = pip()?;
-    let unfinished = folder.with_extension("unfinished");
-    for old in [folder, unfinished.as_path()] {
+    let unfinished = native().join("wheels.unfinished");
+    for old in [&folder, &unfinished] {
         if old.exists() {
             fs::remove_dir_all(old).with_context(|| format!("cannot remove {}", old.display()))?;
         }
     }
     let mut command = Command::new(pip);
-    command.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]);
-    if no_deps {
-        command.arg("--no-deps");
-    }
-    run(command.arg("--target").arg(&unfinished).args(requirements))?;
-    fs::write(unfinished.join("installed"), wanted).context("cannot note the installed versions")?;
-    fs::rename(&unfinished, folder).with_context(|| format!("cannot move into {}", folder.display()))
+    command.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps", "--target"]);
+    run(command.arg(&unfinished).args(wheels))?;
+    fs::write(unfinished.join("installed"), wheels.join("\n"))
+        .context("cannot note the installed versions")?;
+    fs::rename(&unfinished, &folder).with_context(|| format!("cannot move into {}", folder.display()))
 }
 
 /// A Python with pip that belongs to us, so that a distribution's pip rules do not matter.
@@ -103,20 +107,6 @@ fn pip() -> Result<PathBuf> {
         run(Command::new("python3").args(["-m", "venv"]).arg(&venv))?;
     }
     Ok(python)
-}
-
-/// The pinned `nvidia-…` requirements that torch's own metadata names.
-fn nvidia_requirements(_of: &[&str]) -> Result<Vec<String>> {
-    let metadata = native().join("wheels/torch-2.11.0.dist-info/METADATA");
-    let text = fs::read_to_string(&metadata)
-        .with_context(|| format!("cannot read {}: run `cargo xtask setup` first", metadata.display()))?;
-    let names = text
-        .lines()
-        .filter_map(|line| line.strip_prefix("Requires-Dist: "))
-        .map(|line| line.split(';').next().unwrap_or(line).replace(['(', ')', ' '], ""))
-        .filter(|name| name.starts_with("nvidia-") || name.starts_with("cuda-"))
-        .collect();
-    Ok(names)
 }
 
 /// `mujoco-rs` wants a folder that holds `libmujoco.so`; the wheel names it by its version.
@@ -138,12 +128,7 @@ fn link_mujoco() -> Result<()> {
 /// Writes `.cargo/native.toml` when its content changes: an unchanged file rebuilds nothing.
 fn write_cargo_settings() -> Result<()> {
     let wheels = native().join("wheels");
-    let libraries = [
-        wheels.join("mujoco"),
-        wheels.join("torch/lib"),
-        wheels.join("nvidia/cu13/lib"),
-        wheels.join("nvidia/cuda_cupti/lib"),
-    ];
+    let libraries = [wheels.join("mujoco"), wheels.join("torch/lib"), wheels.join("nvidia/cu13/lib")];
     let flags: Vec<toml::Value> = libraries
         .iter()
         .filter(|folder| folder.is_dir())

@@ -48,10 +48,9 @@ pub(crate) fn install_debian_packages() -> Result<()> {
         return Ok(());
     }
     println!("Installing Debian packages: {names}");
-    for arguments in [
-        vec!["update", "-qq"],
-        [vec!["install", "-qq", "-y", "--no-install-recommends"], missing].concat(),
-    ] {
+    for arguments in
+        [vec!["update", "-qq"], [vec!["install", "-qq", "-y", "--no-install-recommends"], missing].concat()]
+    {
         let status = Command::new("apt-get")
             .args(&arguments)
             .env("DEBIAN_FRONTEND", "noninteractive")

@@ -167,7 +167,7 @@ fn a_loss_that_is_not_a_number_stops_the_update_and_says_which() {
     let shape = TaskShape { observation: 1, action: 1, unnormalized: vec![] };
     let mut sac = Sac::new(&shape, &toy_config(), 0, Device::Cpu);
     let mut batch = toy_batch(64, 0.8, &mut ChaCha8Rng::seed_from_u64(0));
-    batch.reward = batch.reward * f64::INFINITY;
+    batch.reward *= f64::INFINITY;
     let before = to_vec(sac.critics.parameters.flat());
     let error = sac.update(&batch).unwrap_err();
     assert_eq!((error.name, error.update), ("critic", 0));

@@ -50,6 +50,8 @@ const CACHE_BYTES: u64 = 32 << 20;
 const CLEAN_EVERY: Duration = Duration::from_millis(500);
 /// How long to wait for the lock of a store that was just closed in this process.
 const LOCK_PATIENCE: Duration = Duration::from_secs(5);
+/// Begins the name of a generation's tree; its number follows, in 16 hexadecimal digits.
+const TREE_PREFIX: &str = "generation-";
 /// sled's folder in the store's.
 const SLED: &str = "log";
 
@@ -77,10 +79,9 @@ pub(crate) struct Log {
 }
 
 /// One tree of the log.
-#[derive(Debug)]
+#[derive(Clone, Copy, Debug)]
 struct Generation {
     number: u64,
-    tree: sled::Tree,
     /// Number in the log of its first segment.
     first_segment: u64,
     transitions: u64,
@@ -102,11 +103,7 @@ impl Log {
             None => create(dir, spec)?,
         };
         let acknowledged = watermark.acknowledged()?;
-        let opened = caught(|| -> Result<_, StoreError> {
-            let db = open_sled(dir)?;
-            let recovered = Recovered::read(dir, &db, spec, acknowledged, replay)?;
-            Ok((db, recovered))
-        });
+        let opened = caught(|| Recovered::read(dir, spec, acknowledged, replay));
         let (db, recovered) = opened
             .map_err(|panic| StoreError::damaged(dir, format!("its log is inconsistent ({panic})")))??;
         let fsync = match config.sync {
@@ -189,7 +186,7 @@ impl Log {
     fn commit(&mut self, segments: &[Segment]) -> Result<(), StoreError> {
         let mut batch = sled::Batch::default();
         if self.full {
-            self.begin_generation(&mut batch)?;
+            self.begin_generation(&mut batch);
         }
         let mut state = self.state;
         for segment in segments {
@@ -211,7 +208,7 @@ impl Log {
         self.state = state;
         self.full = self.generations.back().is_some_and(|newest| self.is_full(newest));
         for generation in self.generations.drain(..excess) {
-            self.db.drop_tree(recovery::tree_name(generation.number)).map_err(StoreError::sled(&self.dir))?;
+            self.db.drop_tree(generation.tree_name()).map_err(StoreError::sled(&self.dir))?;
         }
         Ok(())
     }
@@ -219,7 +216,8 @@ impl Log {
     /// Makes the batch durable in the newest generation.
     fn write(&self, batch: sled::Batch) -> Result<(), StoreError> {
         let newest = self.generations.back().expect("the first commit begins one");
-        newest.tree.apply_batch(batch).map_err(StoreError::sled(&self.dir))?;
+        let tree = self.db.open_tree(newest.tree_name()).map_err(StoreError::sled(&self.dir))?;
+        tree.apply_batch(batch).map_err(StoreError::sled(&self.dir))?;
         self.db.flush().map_err(StoreError::sled(&self.dir))?;
         match &self.fsync {
             Some(file) => file.sync_data().map_err(StoreError::io("sync", &self.dir)),
@@ -227,16 +225,14 @@ impl Log {
         }
     }
 
-    fn begin_generation(&mut self, batch: &mut sled::Batch) -> Result<(), StoreError> {
+    fn begin_generation(&mut self, batch: &mut sled::Batch) {
         let number = self.generations.back().map_or(0, |newest| newest.number + 1);
-        let tree = self.db.open_tree(recovery::tree_name(number)).map_err(StoreError::sled(&self.dir))?;
         let first_segment = self.state.segments;
-        self.generations.push_back(Generation { number, tree, first_segment, transitions: 0 });
+        self.generations.push_back(Generation { number, first_segment, transitions: 0 });
         self.writers.forget_excess();
         for (writer, mark) in self.writers.iter() {
             record::put(batch, Key::Writer(writer), &mark.encode());
         }
-        Ok(())
     }
 
     fn is_full(&self, generation: &Generation) -> bool {
@@ -251,6 +247,12 @@ impl Log {
             held >= self.capacity
         };
         self.generations.iter().take_while(fits).count()
+    }
+}
+
+impl Generation {
+    fn tree_name(&self) -> String {
+        format!("{TREE_PREFIX}{:016x}", self.number)
     }
 }
 

@@ -1,14 +1,16 @@
 //! Reading a log back, and finding out whether it is whole: [`Recovered`].
 
 use super::record::{self, Key, Mark, State};
-use super::{Generation, Writers};
+use super::{Generation, TREE_PREFIX, Writers, open_sled};
 use crate::error::StoreError;
 use getup_proto::{RunSpec, Segment};
 use std::collections::VecDeque;
 use std::ops::Range;
 use std::path::Path;
 
-const TREE_PREFIX: &str = "generation-";
+/// sled keeps in memory what was read from it, whatever its cache's capacity: after so many bytes it is closed and
+/// opened again.
+const MOST_BYTES_READ: usize = 64 << 20;
 
 /// What a log was found to hold.
 #[derive(Debug, Default)]
@@ -19,6 +21,8 @@ pub(crate) struct Recovered {
     pub(super) writers: Writers,
     /// Numbers of the segments found; None before the first.
     found: Option<Range<u64>>,
+    /// Since sled was opened.
+    bytes_read: usize,
 }
 
 /// A segment whose pieces are being read.
@@ -28,44 +32,50 @@ struct Partial {
     message: Vec<u8>,
 }
 
-/// The name of a generation's tree.
-pub(super) fn tree_name(generation: u64) -> String {
-    format!("{TREE_PREFIX}{generation:016x}")
-}
-
 fn generation_number(tree_name: &[u8]) -> Option<u64> {
     u64::from_str_radix(str::from_utf8(tree_name).ok()?.strip_prefix(TREE_PREFIX)?, 16).ok()
 }
 
 impl Recovered {
-    /// Reads all generations, passes their segments to `replay`, and checks that they are all there: without a
-    /// gap, as many as the totals say, and at least as many as were `acknowledged`.
+    /// Opens sled, reads all generations, passes their segments to `replay`, and checks that they are all there:
+    /// without a gap, as many as the totals say, and at least as many as were `acknowledged`.
     pub(super) fn read(
         dir: &Path,
-        db: &sled::Db,
         spec: &RunSpec,
         acknowledged: u64,
         mut replay: impl FnMut(&Segment),
-    ) -> Result<Self, StoreError> {
+    ) -> Result<(sled::Db, Self), StoreError> {
+        let mut db = open_sled(dir)?;
         let mut numbers: Vec<u64> =
             db.tree_names().iter().filter_map(|name| generation_number(name)).collect();
         numbers.sort_unstable();
         let mut recovered = Self::default();
         for number in numbers {
-            let name = tree_name(number);
-            let tree = db.open_tree(&name).map_err(StoreError::sled(dir))?;
-            match recovered.read_generation(&tree, spec, &mut replay) {
-                Err(Unreadable::Sled(error)) => return Err(StoreError::sled(dir)(error)),
-                Err(Unreadable::Damaged(what)) => return Err(StoreError::damaged(dir, what)),
+            let mut generation =
+                Generation { number, first_segment: recovered.state.segments, transitions: 0 };
+            let tree = db.open_tree(generation.tree_name()).map_err(StoreError::sled(dir))?;
+            let found = recovered.read_generation(&tree, spec, &mut replay).map_err(|error| match error {
+                Unreadable::Sled(error) => StoreError::sled(dir)(error),
+                Unreadable::Damaged(what) => StoreError::damaged(dir, what),
+            })?;
+            if let Some(transitions) = found {
+                generation.transitions = transitions;
+                recovered.generations.push_back(generation);
+            } else {
                 // Killed between the creation of the tree and its first commit.
-                Ok(None) => drop(db.drop_tree(&name).map_err(StoreError::sled(dir))?),
-                Ok(Some((first_segment, transitions))) => {
-                    recovered.generations.push_back(Generation { number, tree, first_segment, transitions });
-                }
+                db.drop_tree(generation.tree_name()).map_err(StoreError::sled(dir))?;
+            }
+            if recovered.bytes_read > MOST_BYTES_READ {
+                recovered.bytes_read = 0;
+                drop((tree, db));
+                db = open_sled(dir)?;
             }
         }
+        if let (Some(oldest), Some(found)) = (recovered.generations.front_mut(), &recovered.found) {
+            oldest.first_segment = found.start;
+        }
         recovered.check_whole(acknowledged).map_err(|what| StoreError::damaged(dir, what))?;
-        Ok(recovered)
+        Ok((db, recovered))
     }
 
     fn check_whole(&self, acknowledged: u64) -> Result<(), String> {
@@ -84,19 +94,19 @@ impl Recovered {
         }
     }
 
-    /// Reads a generation and returns the number of its first segment and its transitions; None if it is empty.
+    /// Reads a generation and returns its transitions; None if it is empty.
     fn read_generation(
         &mut self,
         tree: &sled::Tree,
         spec: &RunSpec,
         replay: &mut impl FnMut(&Segment),
-    ) -> Result<Option<(u64, u64)>, Unreadable> {
-        let first_segment = self.state.segments;
+    ) -> Result<Option<u64>, Unreadable> {
         let mut state = None;
         let mut transitions = 0;
         let mut partial: Option<Partial> = None;
         for entry in tree.iter() {
             let (key, value) = entry.map_err(Unreadable::Sled)?;
+            self.bytes_read += value.len();
             let decoded = Key::decode(&key).zip(record::unseal(&key, &value));
             let (key, payload) = decoded.ok_or_else(|| damaged("a record fails its checksum"))?;
             match key {
@@ -127,7 +137,7 @@ impl Recovered {
             (None, _) if transitions == 0 => Ok(None),
             (Some(state), Some(found)) if state.segments == found.end && transitions > 0 => {
                 self.state = state;
-                Ok(Some((first_segment.max(found.start), transitions)))
+                Ok(Some(transitions))
             }
             _ => Err(damaged("its totals and its segments disagree")),
         }
