@@ -6,7 +6,7 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use getup_sim::{GetUp, Task};
 use serde::Serialize;
 
@@ -14,6 +14,8 @@ use crate::config::{Config, ConfigArgs};
 
 /// Seconds from 1970 to 2024: a clock before that was never set.
 const CLOCK_IS_SET: u64 = 1_704_067_200;
+/// The MuJoCo that recorded rollouts are compared with.
+const MUJOCO: &str = "3.17.0";
 const GIB: u64 = 1 << 30;
 
 /// Check this machine and a configuration before a run does: libraries, ports, disk, memory, clock.
@@ -75,7 +77,14 @@ fn physics(config: &Config) -> Result<String> {
     let task = GetUp::new(&config.task, config.control_limit())?;
     let (observation, action) = (task.observation_width(), task.action_width());
     let character = config.task.character;
-    Ok(format!("MuJoCo loads the {character} character: {observation} observed numbers, {action} motors"))
+    let version = getup_sim::mujoco_version();
+    ensure!(
+        version == MUJOCO,
+        "MuJoCo {version} is loaded, not {MUJOCO}: run `cargo xtask setup` and build again"
+    );
+    Ok(format!(
+        "MuJoCo {version} loads the {character} character: {observation} observed numbers, {action} motors"
+    ))
 }
 
 fn processor(config: &Config) -> Result<String> {

@@ -8,22 +8,22 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use getup_policy::Policy;
 use getup_proto::{PolicyVersion, v1};
 use getup_replay::{Minibatch, MinibatchSource, ReplayCounters, SampleError};
 use getup_telemetry::{Registry, Shutdown};
-use serde::Serialize;
 use tch::Tensor;
 
 use crate::checkpoint::{Checkpoint, CheckpointError, Progress};
 use crate::config::{ConfigError, CurriculumConfig, EvaluationConfig, LearnerConfig, SacConfig};
-use crate::curriculum::{Curriculum, Decision, Outcome, StageResult};
-use crate::hub::{Evaluation, Hub, Standing};
+use crate::curriculum::{Curriculum, Outcome};
+use crate::hub::{Hub, Standing};
 use crate::metrics::LearnerMetrics;
-use crate::run_folder::{FolderError, RunFolder, append_line};
+use crate::run_folder::{FolderError, RunFolder};
 use crate::sac::{Batch, NonFiniteLoss, Sac, TaskShape};
 
+mod broadcast;
 mod checkpoints;
+mod evaluations;
 mod pace;
 
 use checkpoints::Checkpoints;
@@ -95,30 +95,6 @@ pub enum Ending {
     Steps(u64),
     /// It was asked to stop; the checkpoint resumes it.
     Shutdown,
-}
-
-/// A line of `evaluations.jsonl`.
-#[derive(Debug, Serialize)]
-struct EvaluationLine<'a> {
-    version: String,
-    env_steps: u64,
-    updates: u64,
-    stage: u32,
-    beta: f64,
-    mean: f64,
-    min: f64,
-    returns: &'a [f64],
-}
-
-/// A line of `timings.jsonl`.
-#[derive(Debug, Serialize)]
-struct TimingLine {
-    version: String,
-    env_steps: u64,
-    updates: u64,
-    /// Since this process began to train.
-    seconds: f64,
-    updates_per_second: f64,
 }
 
 /// The state of a training run.
@@ -294,154 +270,9 @@ impl Trainer {
         Ok(())
     }
 
-    fn evaluated(
-        &mut self,
-        evaluation: &Evaluation,
-        episodes: &[v1::EpisodeResult],
-    ) -> Result<(), TrainError> {
-        let policy = &evaluation.policy;
-        let returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
-        let mean = returns.iter().sum::<f64>() / returns.len() as f64;
-        let min = returns.iter().copied().fold(f64::INFINITY, f64::min);
-        let version = PolicyVersion::from(policy.version.unwrap_or_default());
-        let (beta, stage) = (policy.values["beta"], policy.stage);
-        let line = EvaluationLine {
-            version: version.to_string(),
-            env_steps: policy.env_steps,
-            updates: evaluation.updates,
-            stage,
-            beta,
-            mean,
-            min,
-            returns: &returns,
-        };
-        append_line(&self.folder.evaluations(), &line)?;
-        let timing = TimingLine {
-            version: line.version,
-            env_steps: line.env_steps,
-            updates: line.updates,
-            seconds: self.pace.seconds(),
-            updates_per_second: self.pace.per_second(),
-        };
-        append_line(&self.folder.timings(), &timing)?;
-        tracing::info!(
-            env_steps = policy.env_steps,
-            updates = evaluation.updates,
-            beta,
-            mean,
-            min,
-            "evaluation"
-        );
-        self.metrics.evaluations.inc();
-        self.metrics.evaluation_return_mean.set(mean);
-        self.metrics.evaluation_return_min.set(min);
-        let env_steps = policy.env_steps;
-        self.evaluation = Some(v1::EvaluationSummary { version: policy.version, env_steps, mean, min, beta });
-        let result = StageResult { stage, env_steps, min_return: min };
-        let decision = self.curriculum.report(result, self.progress.env_steps);
-        self.decided(decision, evaluation, (mean, min))
-    }
-
-    fn decided(
-        &mut self,
-        decision: Decision,
-        evaluation: &Evaluation,
-        (mean, min): (f64, f64),
-    ) -> Result<(), TrainError> {
-        let passed = match decision {
-            Decision::Ignore | Decision::Stay => None,
-            Decision::Promote { passed, next } => {
-                tracing::info!(passed, next, min, "promoted: the next stage is weaker");
-                self.metrics.promotions.inc();
-                Some(passed)
-            }
-            Decision::Finish(outcome) => {
-                tracing::info!(?outcome, "the curriculum is over");
-                self.ending = Some(Ending::Curriculum(outcome));
-                match outcome {
-                    Outcome::FloorPassed { beta } => Some(beta),
-                    Outcome::StageOutlasted { .. } => None,
-                }
-            }
-        };
-        if let Some(beta) = passed {
-            let model = Policy::from_bytes(&evaluation.policy.networks[0].model)?;
-            let mut model = self.describe(model, beta);
-            model.metadata.insert("env_steps".into(), evaluation.policy.env_steps.to_string());
-            model.metadata.insert("updates".into(), evaluation.updates.to_string());
-            model.metadata.insert("evaluation_mean".into(), mean.to_string());
-            model.metadata.insert("evaluation_min".into(), min.to_string());
-            model.save(self.folder.model(&format!("stage-{}", evaluation.policy.stage)))?;
-            model.save(self.folder.model("best"))?;
-        }
-        if decision != Decision::Ignore && decision != Decision::Stay {
-            self.checkpoint();
-        }
-        if matches!(decision, Decision::Promote { .. }) {
-            self.publish();
-        }
-        self.show();
-        Ok(())
-    }
-
-    /// Broadcasts the actor as it is now, under a new version (but the first).
-    fn publish(&mut self) -> Arc<v1::PolicyUpdate> {
-        let policy = self.describe(self.sac.policy(), self.curriculum.beta());
-        self.broadcast(&policy, false)
-    }
-
-    /// Broadcasts the policy that training ends with: the snapshot of the last stage that passed, or the newest.
-    fn publish_final(&mut self) -> Result<(), TrainError> {
-        let best = self.folder.model("best");
-        let policy = match self.ending {
-            Some(Ending::Curriculum(_)) if best.exists() => Policy::load(best)?,
-            _ => self.describe(self.sac.policy(), self.curriculum.beta()),
-        };
-        self.broadcast(&policy, true);
-        Ok(())
-    }
-
-    fn broadcast(&mut self, policy: &Policy, finished: bool) -> Arc<v1::PolicyUpdate> {
-        let update = Arc::new(v1::PolicyUpdate {
-            version: Some(self.version.into()),
-            networks: vec![v1::NamedNetwork { name: "policy".into(), model: policy.to_bytes().into() }],
-            values: [("beta".to_owned(), self.curriculum.beta())].into(),
-            stage: self.curriculum.stage(),
-            env_steps: self.progress.env_steps,
-            uniform: self.progress.env_steps < self.config.sac.uniform_steps && self.sac.updates() == 0,
-            finished,
-        });
-        self.metrics.policy_version.set(self.version.counter as i64);
-        self.version.counter += 1;
-        self.hub.publish(Arc::clone(&update));
-        update
-    }
-
-    fn offer(&mut self, policy: Arc<v1::PolicyUpdate>) {
-        self.evaluated_updates = self.sac.updates();
-        self.hub.offer(Evaluation { policy, updates: self.sac.updates() });
-    }
-
     fn checkpoint(&mut self) {
         let checkpoint = Checkpoint::take(&self.sac, &self.curriculum, &self.progress);
         self.checkpoints.write(checkpoint);
-    }
-
-    /// Adds what a model file says of itself.
-    fn describe(&self, mut policy: Policy, beta: f64) -> Policy {
-        for (key, value) in [
-            ("beta", beta.to_string()),
-            ("stage", self.curriculum.stage().to_string()),
-            ("task", "getup".to_owned()),
-            ("character", self.config.character.clone()),
-            ("run", self.config.run.clone()),
-            ("seed", self.config.seed.to_string()),
-            ("env_steps", self.progress.env_steps.to_string()),
-            ("updates", self.sac.updates().to_string()),
-        ] {
-            policy.metadata.insert(key.to_owned(), value);
-        }
-        policy
     }
 
     /// Tells hub and metrics where the training stands.

@@ -129,6 +129,16 @@ fn a_malformed_segment_is_refused_with_its_reason() {
 }
 
 #[test]
+fn a_segment_put_together_by_hand_is_checked_like_a_parsed_one() {
+    assert_eq!(segment(4, 0.5).check(&spec()), Ok(()));
+    let mut wrong = segment(4, 0.5);
+    wrong.columns[2] = columns::encode(&[f32::NAN; 4]);
+    assert_eq!(wrong.check(&spec()).unwrap_err().kind(), "non_finite");
+    wrong.steps = 3;
+    assert_eq!(wrong.check(&spec()).unwrap_err().kind(), "dimensions");
+}
+
+#[test]
 fn a_segment_without_a_policy_version_is_refused() {
     let mut wire = segment(4, 0.5).to_wire();
     wire.last_version = None;

@@ -1,4 +1,25 @@
-//! Replay.
+//! Replay: keeps the transitions of a run durably, and hands them out in minibatches at the right pace.
+//!
+//! # From a segment to a minibatch
+//! An actor's [`Segment`](getup_proto::Segment) comes in over gRPC ([`serve`]) or from the same process
+//! ([`Store::append`]). It is committed to the log, with others, and is acknowledged only when it would survive
+//! the process being killed. Then it enters the ring, from where samplers gather minibatches: over gRPC
+//! ([`RemoteSource`]) or in the same process ([`LocalSource`]); a learner sees a [`MinibatchSource`] either way.
+//! Between the two sides stands the rate limiter: whoever is ahead waits, and can say why.
+//!
+//! # The modules
+//! | module | what it is |
+//! | --- | --- |
+//! | `store` | [`Store`]: the parts below, put together |
+//! | `log` | the durable log over sled: commits, eviction, recovery |
+//! | `ring` | the newest transitions in memory |
+//! | `gather` | from drawn rows to contiguous columns, with n-step returns |
+//! | `sampler` | [`Sampler`]: which transitions are drawn |
+//! | `limiter` | Reverb's cursor between two bounds, a pure state machine |
+//! | `gate` | the limiter with its doors: who waits there, and for whom |
+//! | `service` | [`serve`]: the streams of writers and samplers |
+//! | `source`, `remote` | [`MinibatchSource`], in process and over gRPC; [`describe`] |
+//! | `minibatch`, `config`, `error`, `metrics` | [`Minibatch`], [`ReplayConfig`], [`StoreError`], [`ReplayMetrics`] |
 
 mod config;
 mod error;

@@ -240,6 +240,30 @@ fn describe_tells_sizes_counters_limiter_and_writers() {
 }
 
 #[test]
+fn metrics_follow_what_is_appended_and_sampled() {
+    let replay = Replay::start(spec(8), &config());
+    replay.store.append((1..=10).map(|i| segment(&replay.spec, 1, i, 8)).collect()).unwrap();
+    let mut source =
+        LocalSource::new(replay.store.clone(), options(16), "learner", replay.shutdown.clone()).unwrap();
+    source.next().unwrap();
+    let families = replay.registry.gather();
+    let value = |name: &str| {
+        let family = families.iter().find(|family| family.name() == format!("getup_replay_{name}"));
+        let metric = &family.expect(name).get_metric()[0];
+        metric.get_counter().get_value()
+            + metric.get_gauge().get_value()
+            + metric.get_histogram().get_sample_count() as f64
+    };
+    assert_eq!((value("transitions"), value("capacity_transitions")), (80.0, 10_000.0));
+    assert_eq!((value("env_steps_total"), value("inserted_transitions_total")), (80.0, 80.0));
+    assert_eq!((value("sampled_transitions_total"), value("episodes_total")), (16.0, 0.0));
+    assert_eq!((value("append_seconds"), value("sample_seconds"), value("commit_segments")), (1.0, 1.0, 1.0));
+    assert!(
+        value("memory_bytes") > 0.0 && value("disk_bytes") >= 0.0 && value("limiter_cursor_samples") == 0.0
+    );
+}
+
+#[test]
 fn shutdown_acknowledges_what_came_tells_clients_and_takes_little_time() {
     let replay = Replay::start(spec(8), &config());
     let mut writer = replay.writer(1);

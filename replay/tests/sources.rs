@@ -6,9 +6,13 @@ mod fixtures;
 use common::{Replay, config, eventually, options};
 use fixtures::{Ending, Part, segment, spec, value};
 use getup_replay::{
-    LocalSource, MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, SampleError, SampleOptions,
+    LocalSource, Minibatch, MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, ReplayMetrics,
+    SampleError, SampleOptions, Store, serve,
 };
+use getup_telemetry::{Registry, Shutdown, Waits};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
+use tokio::net::TcpListener;
 
 /// How to get a source from a replay.
 type Connect = fn(&Replay, SampleOptions) -> Result<Box<dyn MinibatchSource>, SampleError>;
@@ -202,4 +206,43 @@ fn shutdown_ends_a_wait(connect: Connect) {
     result.unwrap();
     assert!(matches!(waiting.join().unwrap(), Err(SampleError::Shutdown)));
     assert!(started.elapsed() < Duration::from_secs(3));
+}
+
+#[test]
+fn a_remote_source_waits_for_the_service_and_comes_back_after_its_restart_with_other_draws() {
+    let dir = tempfile::TempDir::new().unwrap();
+    let (registry, shutdown) = (Registry::new(), Shutdown::new());
+    let waits = Waits::new(&registry);
+    let metrics = ReplayMetrics::new(&registry);
+    let store = Arc::new(Store::open(dir.path(), &spec(8), &config(), metrics, waits.clone()).unwrap());
+    store.append((1..=100).map(|i| segment(&spec(8), 1, i, 8)).collect()).unwrap();
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let bind = |address: &str| runtime.block_on(TcpListener::bind(address)).unwrap();
+    let endpoint = bind("127.0.0.1:0").local_addr().unwrap().to_string();
+
+    let options = RemoteOptions {
+        endpoint: endpoint.clone(),
+        spec: spec(8),
+        sample: options(32),
+        name: "learner".to_owned(),
+        prefetch: 1,
+    };
+    let mut source = RemoteSource::new(options, runtime.handle(), waits.clone(), shutdown);
+    assert!(source.poll(Duration::from_millis(200)).unwrap().is_none());
+    let mut drawn: Vec<Minibatch> = Vec::new();
+    for _ in 0..3 {
+        let ends = Shutdown::new();
+        let serving = runtime.spawn(serve(bind(&endpoint), store.clone(), ends.clone()));
+        drawn.extend((0..3).map(|_| source.next().unwrap()));
+        ends.trigger();
+        runtime.block_on(serving).unwrap().unwrap();
+    }
+    let waiting = std::thread::spawn(move || while source.poll(Duration::from_secs(2)).unwrap().is_some() {});
+    eventually("the wait names the service", || {
+        waits.current().iter().any(|wait| wait.reason.contains(&format!("replay at {endpoint}")))
+    });
+    waiting.join().unwrap();
+    for (i, minibatch) in drawn.iter().enumerate() {
+        assert!(drawn[..i].iter().all(|other| other.columns != minibatch.columns), "drawn twice");
+    }
 }

@@ -48,3 +48,8 @@ pub use reset::{Fall, Resets, Source};
 pub use task::Task;
 pub use tolerance::{Sigmoid, tolerance};
 pub use world::{Body, Divergence, SavedState, World};
+
+/// The version of the MuJoCo library that is loaded, such as `3.17.0`.
+pub fn mujoco_version() -> &'static str {
+    mujoco_rs::mujoco_version()
+}

@@ -1,7 +1,7 @@
 //! The durable log of segments, over sled: [`Log`].
 //!
 //! A commit is one sled batch in one tree, which is atomic when the process is killed: the segments' pieces, the
-//! marks of their writers, and the totals. Then comes a flush, then the [watermark](watermark), and only then the
+//! marks of their writers, and the totals. Then comes a flush, then the [watermark], and only then the
 //! acknowledgement.
 //!
 //! Trees are *generations*: each takes a sixteenth of the capacity, and when the others hold the capacity, the

@@ -1,0 +1,127 @@
+//! What a reported evaluation brings: a line in the run's folder, and the curriculum's decision.
+
+use getup_policy::Policy;
+use getup_proto::{PolicyVersion, v1};
+use serde::Serialize;
+
+use super::{Ending, TrainError, Trainer};
+use crate::curriculum::{Decision, Outcome, StageResult};
+use crate::hub::Evaluation;
+use crate::run_folder::append_line;
+
+/// A line of `evaluations.jsonl`.
+#[derive(Debug, Serialize)]
+struct EvaluationLine<'a> {
+    version: String,
+    env_steps: u64,
+    updates: u64,
+    stage: u32,
+    beta: f64,
+    mean: f64,
+    min: f64,
+    returns: &'a [f64],
+}
+
+/// A line of `timings.jsonl`.
+#[derive(Debug, Serialize)]
+struct TimingLine {
+    version: String,
+    env_steps: u64,
+    updates: u64,
+    /// Since this process began to train.
+    seconds: f64,
+    updates_per_second: f64,
+}
+
+impl Trainer {
+    /// Records an evaluation, and lets the curriculum decide.
+    pub(super) fn evaluated(
+        &mut self,
+        evaluation: &Evaluation,
+        episodes: &[v1::EpisodeResult],
+    ) -> Result<(), TrainError> {
+        let policy = &evaluation.policy;
+        let returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
+        let mean = returns.iter().sum::<f64>() / returns.len() as f64;
+        let min = returns.iter().copied().fold(f64::INFINITY, f64::min);
+        let version = PolicyVersion::from(policy.version.unwrap_or_default());
+        let (beta, stage) = (policy.values["beta"], policy.stage);
+        let line = EvaluationLine {
+            version: version.to_string(),
+            env_steps: policy.env_steps,
+            updates: evaluation.updates,
+            stage,
+            beta,
+            mean,
+            min,
+            returns: &returns,
+        };
+        append_line(&self.folder.evaluations(), &line)?;
+        let timing = TimingLine {
+            version: line.version,
+            env_steps: line.env_steps,
+            updates: line.updates,
+            seconds: self.pace.seconds(),
+            updates_per_second: self.pace.per_second(),
+        };
+        append_line(&self.folder.timings(), &timing)?;
+        tracing::info!(
+            env_steps = policy.env_steps,
+            updates = evaluation.updates,
+            beta,
+            mean,
+            min,
+            "evaluation"
+        );
+        self.metrics.evaluations.inc();
+        self.metrics.evaluation_return_mean.set(mean);
+        self.metrics.evaluation_return_min.set(min);
+        let env_steps = policy.env_steps;
+        self.evaluation = Some(v1::EvaluationSummary { version: policy.version, env_steps, mean, min, beta });
+        let result = StageResult { stage, env_steps, min_return: min };
+        let decision = self.curriculum.report(result, self.progress.env_steps);
+        self.decided(decision, evaluation, (mean, min))
+    }
+
+    fn decided(
+        &mut self,
+        decision: Decision,
+        evaluation: &Evaluation,
+        (mean, min): (f64, f64),
+    ) -> Result<(), TrainError> {
+        let passed = match decision {
+            Decision::Ignore | Decision::Stay => None,
+            Decision::Promote { passed, next } => {
+                tracing::info!(passed, next, min, "promoted: the next stage is weaker");
+                self.metrics.promotions.inc();
+                Some(passed)
+            }
+            Decision::Finish(outcome) => {
+                tracing::info!(?outcome, "the curriculum is over");
+                self.ending = Some(Ending::Curriculum(outcome));
+                match outcome {
+                    Outcome::FloorPassed { beta } => Some(beta),
+                    Outcome::StageOutlasted { .. } => None,
+                }
+            }
+        };
+        if let Some(beta) = passed {
+            let model = Policy::from_bytes(&evaluation.policy.networks[0].model)?;
+            let mut model = self.describe(model, beta);
+            model.metadata.insert("env_steps".into(), evaluation.policy.env_steps.to_string());
+            model.metadata.insert("updates".into(), evaluation.updates.to_string());
+            model.metadata.insert("evaluation_mean".into(), mean.to_string());
+            model.metadata.insert("evaluation_min".into(), min.to_string());
+            model.save(self.folder.model(&format!("stage-{}", evaluation.policy.stage)))?;
+            model.save(self.folder.model("best"))?;
+        }
+        if decision != Decision::Ignore && decision != Decision::Stay {
+            self.checkpoint();
+        }
+        if matches!(decision, Decision::Promote { .. }) {
+            self.publish();
+        }
+        self.show();
+        Ok(())
+    }
+}
