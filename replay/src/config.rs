@@ -18,8 +18,6 @@ pub enum SyncMode {
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReplayConfig {
-    /// Where the service listens, as `host:port`.
-    pub listen: String,
     /// Transitions that can be sampled at once; the oldest go first.
     pub capacity: usize,
     /// Env steps that must have come before the first sample; limp steps do not count.
@@ -37,7 +35,6 @@ pub struct ReplayConfig {
 impl Default for ReplayConfig {
     fn default() -> Self {
         Self {
-            listen: "127.0.0.1:7301".to_owned(),
             capacity: 1_000_000,
             min_size: 1_000,
             samples_per_insert: None,
