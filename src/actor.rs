@@ -3,14 +3,14 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
+use getup_actor::config::ActorConfig;
 use getup_actor::grpc::{GrpcLearner, GrpcReplay};
 use getup_actor::identity::Identity;
 use getup_actor::worker::{self, ActorSetup};
 use getup_telemetry::health;
-use tokio_stream::wrappers::TcpListenerStream;
 
 use crate::config::Config;
-use crate::role::{Role, RoleArgs, bind, host_name};
+use crate::role::{Role, RoleArgs, bind, grpc_server, host_name, serve_grpc};
 
 /// Run an actor: simulates episodes under the newest policy, pushes them to the replay, plays leased evaluations.
 ///
@@ -19,7 +19,7 @@ use crate::role::{Role, RoleArgs, bind, host_name};
 pub(crate) struct Args {
     #[command(flatten)]
     role: RoleArgs,
-    /// Names this actor in logs, metrics and `getup status`. [default: host name and process id]
+    /// Names this actor in logs, metrics and `getup status`. [default: actor.name, or host name and process id]
     #[arg(long)]
     name: Option<String>,
     /// Where the states of simulations that diverged are kept, for `getup rollout`.
@@ -29,7 +29,13 @@ pub(crate) struct Args {
 
 pub(crate) fn run(arguments: Args) -> Result<()> {
     let mut config = arguments.role.config.load()?;
-    config.actor.name = arguments.name.unwrap_or_else(|| format!("{}-{}", host_name(), std::process::id()));
+    if let Some(name) = arguments.name {
+        config.actor.name = name;
+    } else if config.actor.name == ActorConfig::default().name {
+        // Actors of one configuration are told apart.
+        config.actor.name = format!("{}-{}", host_name(), std::process::id());
+    }
+    config.validate()?;
     let role = Role::new("actor", arguments.role.log_format)?;
     role.run(serve(&config, &role, arguments.diverged))
 }
@@ -46,11 +52,7 @@ async fn serve(config: &Config, role: &Role, diverged: PathBuf) -> Result<()> {
     let listener = bind(&network.actor, "gRPC health").await?;
     tracing::info!(name = config.actor.name, health = %listener.local_addr()?, "actor started");
     let (_reporter, health) = health();
-    let ended = role.shutdown.clone();
-    let server = tonic::transport::Server::builder()
-        .add_service(health)
-        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move { ended.wait().await });
-    let server = tokio::spawn(server);
+    let server = tokio::spawn(serve_grpc(grpc_server().add_service(health), listener, role.shutdown.clone()));
     let result = worker::run(setup, writer, link, waits.clone(), role.shutdown.clone(), &role.registry).await;
     role.shutdown.trigger();
     server.await??;

@@ -133,16 +133,21 @@ impl ConfigArgs {
         let mut layers = Layers::new()?;
         let file = self.config.as_deref().map(read_table).transpose()?;
         let from_file = file.as_ref().and_then(|table| table.get("preset")).and_then(|value| value.as_str());
-        layers.preset(self.preset.as_deref().or(from_file).unwrap_or("laptop"))?;
+        if let (Some(asked), Some(made)) = (&self.preset, from_file) {
+            ensure!(
+                asked == made,
+                "--preset {asked}: the configuration was made from preset {made}; leave one out"
+            );
+        }
+        let from_environment = std::env::var(layers::PRESET_VARIABLE).ok();
+        let preset = self.preset.as_deref().or(from_file).or(from_environment.as_deref());
+        layers.preset(preset.unwrap_or("laptop"))?;
         if let (Some(path), Some(table)) = (&self.config, file) {
             layers.overlay(&path.display().to_string(), table)?;
         }
-        layers.environment(std::env::vars())?;
+        layers.environment(std::env::vars_os())?;
         for assignment in &self.set {
             layers.set("--set", assignment)?;
-        }
-        if let Some(preset) = &self.preset {
-            layers.set("--preset", &format!("preset={preset}"))?;
         }
         layers.finish()
     }
@@ -164,6 +169,12 @@ impl Config {
         );
         self.task.validate()?;
         self.actor.validate()?;
+        ensure!(
+            self.sac.uniform_steps <= self.replay.capacity as u64,
+            "sac.uniform_steps = {}: at most replay.capacity ({}), or they would never all be there",
+            self.sac.uniform_steps,
+            self.replay.capacity
+        );
         self.replay_config().validate_for(&self.run_spec()?)?;
         self.sac.validate()?;
         self.curriculum.validate()?;
@@ -185,12 +196,16 @@ impl Config {
 
     /// The replay's settings: it is sampled as often as `[sac]` says, once its uniform steps are there.
     pub(crate) fn replay_config(&self) -> ReplayConfig {
+        let samples_per_insert = self.sac.updates_per_step * self.sac.batch as f64;
+        let middle = self.sac.uniform_steps as f64 * samples_per_insert;
+        let segment = self.actor.segment_steps as f64 * samples_per_insert;
         ReplayConfig {
             capacity: self.replay.capacity,
             sync: self.replay.sync,
             min_size: self.sac.uniform_steps.max(1),
-            samples_per_insert: Some(self.sac.updates_per_step * self.sac.batch as f64),
-            ..ReplayConfig::default()
+            samples_per_insert: Some(samples_per_insert),
+            // A tenth of the first minibatches, and room for two of the longest segments and for a minibatch.
+            error_buffer: Some((0.1 * middle).max(2.0 * segment).max(2.0 * self.sac.batch as f64)),
         }
     }
 
@@ -200,7 +215,18 @@ impl Config {
         let column = |name: &str, width, rows| ColumnSpec { name: name.into(), width, rows };
         Ok(RunSpec {
             run: self.run.clone(),
-            task: format!("{}/{}", self.task.name, self.task.character),
+            // Whoever simulates otherwise is refused: transitions and evaluations must be of one kind.
+            task: format!(
+                "{}/{}, {} Hz, falls of {} steps with {}, {} steps, stand {:?}, clamp {}",
+                self.task.name,
+                self.task.character,
+                self.task.physics_hz,
+                self.task.ragdoll_steps,
+                self.task.ragdoll_std,
+                self.task.episode_steps,
+                self.task.stand,
+                self.control_limit()
+            ),
             columns: vec![
                 column(columns::OBSERVATION, task.observation_width(), Rows::StepsPlusOne),
                 column(columns::ACTION, task.action_width(), Rows::Steps),
@@ -230,7 +256,7 @@ mod tests {
     fn load(arguments: &[&str], environment: &[(&str, &str)]) -> Result<Config> {
         let mut layers = Layers::new()?;
         layers.preset("paper")?;
-        layers.environment(environment.iter().map(|(key, value)| (key.to_string(), value.to_string())))?;
+        layers.environment(environment.iter().map(|(key, value)| (key.into(), value.into())))?;
         for assignment in arguments {
             layers.set("--set", assignment)?;
         }

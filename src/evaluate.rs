@@ -67,7 +67,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         "--episodes {}: from 1 to 1000000",
         arguments.episodes
     );
-    let policy = Policy::load(&arguments.model)?;
+    let policy = Policy::load(&arguments.model).with_context(|| arguments.model.display().to_string())?;
     let Some(beta) = arguments.beta.or_else(|| policy.number("beta")) else {
         bail!("the model names no beta: give one with --beta");
     };

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::Result;
+use anyhow::{Context, Result, ensure};
 use getup_learner::device::{self, Device};
 use getup_learner::hub::Hub;
 use getup_learner::run_folder::{RunFolder, write_atomically};
@@ -16,10 +16,9 @@ use getup_sim::{GetUp, Task};
 use getup_telemetry::health;
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use tokio_stream::wrappers::TcpListenerStream;
 
 use crate::config::Config;
-use crate::role::{Role, RoleArgs, bind};
+use crate::role::{Role, RoleArgs, bind, grpc_server, serve_grpc};
 
 /// Minibatches that are on their way while one is trained on.
 const PREFETCH: usize = 8;
@@ -45,21 +44,19 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
 }
 
 async fn serve(config: &Config, role: &Role, folder: RunFolder, device: Device) -> Result<()> {
+    check_preset(config, &folder)?;
     folder.create()?;
-    write_atomically(&folder.config(), config.to_toml()?.as_bytes())?;
     let (hub, incarnation) = make_hub(config, role, &folder)?;
     let address = &config.network.learner;
     let listener = bind(address, "gRPC").await?;
-    role.serve_metrics(&config.network.learner_metrics).await?;
     tracing::info!("learner serves gRPC at {}", listener.local_addr()?);
+    let mut trainer =
+        make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, true)?;
+    write_atomically(&folder.config(), config.to_toml()?.as_bytes())?;
+    role.serve_metrics(&config.network.learner_metrics).await?;
     let (_reporter, health) = health();
-    let ended = role.shutdown.clone();
-    let server = tonic::transport::Server::builder()
-        .add_service(health)
-        .add_service(service(Arc::clone(&hub), role.shutdown.clone()))
-        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move { ended.wait().await });
-    let server = tokio::spawn(server);
-    let mut trainer = make_trainer(config, role, folder, hub, incarnation, device, true)?;
+    let server = grpc_server().add_service(health).add_service(service(hub, role.shutdown.clone()));
+    let server = tokio::spawn(serve_grpc(server, listener, role.shutdown.clone()));
     let options = RemoteOptions {
         endpoint: config.network.replay.clone(),
         spec: config.run_spec()?,
@@ -81,6 +78,20 @@ async fn serve(config: &Config, role: &Role, folder: RunFolder, device: Device) 
     role.shutdown.trigger();
     server.await??;
     Ok(result.map(drop)?)
+}
+
+/// A run goes on under the preset it began with.
+fn check_preset(config: &Config, folder: &RunFolder) -> Result<()> {
+    let Ok(text) = std::fs::read_to_string(folder.config()) else { return Ok(()) };
+    let table: toml::Table = text.parse().with_context(|| folder.config().display().to_string())?;
+    let preset = table.get("preset").and_then(|value| value.as_str()).unwrap_or(&config.preset);
+    ensure!(
+        preset == config.preset,
+        "the run in {} has preset {preset}, not {}: leave --preset as it was, or choose another --run",
+        folder.root().display(),
+        config.preset
+    );
+    Ok(())
 }
 
 /// The meeting place of this learner and its actors, and the number of this start of a learner on the run.

@@ -32,8 +32,15 @@ async fn start(config: &Config, role: &Role, dir: PathBuf) -> Result<()> {
     std::fs::create_dir_all(&dir)?;
     let (spec, settings) = (config.run_spec()?, config.replay_config());
     let metrics = ReplayMetrics::new(&role.registry);
-    let store = Store::open(&dir, &spec, &settings, metrics, role.waits.clone())?;
-    tracing::info!("replay serves gRPC at {}, its store is {}", listener.local_addr()?, dir.display());
+    tracing::info!("replay will serve gRPC at {}, its store is {}", listener.local_addr()?, dir.display());
+    let (waits, folder) = (role.waits.clone(), dir.clone());
+    let reading = role.waits.begin("replay", format!("the log in {} is read back", dir.display()));
+    let opening = tokio::task::spawn_blocking(move || Store::open(&folder, &spec, &settings, metrics, waits));
+    let store = tokio::select! {
+        opened = opening => opened??,
+        () = role.shutdown.wait() => return Ok(()),
+    };
+    drop(reading);
     serve(listener, Arc::new(store), role.shutdown.clone()).await?;
     tracing::info!("replay ended: everything acknowledged is stored");
     Ok(())

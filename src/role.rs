@@ -3,13 +3,21 @@
 use std::future::Future;
 use std::io::{self, Write};
 use std::net::SocketAddr;
+use std::time::Duration;
 
 use anyhow::{Context, Result};
 use getup_telemetry::{LogFormat, Registry, Shutdown, Waits, build_info, init_logging, serve_http};
 use indicatif::MultiProgress;
 use tokio::net::TcpListener;
+use tokio_stream::wrappers::TcpListenerStream;
+use tonic::transport::server::Router;
 
 use crate::config::ConfigArgs;
+
+/// How long the end of a process waits for what does not end by itself.
+const GRACE: Duration = Duration::from_secs(2);
+/// A peer that does not answer pings for this long is gone.
+const PING_EVERY: Duration = Duration::from_secs(10);
 
 /// What every role's command line shares.
 #[derive(clap::Args, Clone, Debug)]
@@ -56,10 +64,13 @@ impl Role {
             .enable_all()
             .build()
             .context("cannot start the asynchronous runtime")?;
-        runtime.block_on(async {
+        let result = runtime.block_on(async {
             self.shutdown.on_signals().context("cannot watch for signals")?;
             work.await
-        })
+        });
+        // A thread that the disk or a peer holds up must not hold up the end.
+        runtime.shutdown_timeout(GRACE);
+        result
     }
 
     /// Serves `/metrics` at `address` until shutdown; returns where.
@@ -77,10 +88,33 @@ impl Role {
     }
 }
 
+/// A gRPC server that drops connections whose peers do not answer.
+pub(crate) fn grpc_server() -> tonic::transport::Server {
+    tonic::transport::Server::builder()
+        .http2_keepalive_interval(Some(PING_EVERY))
+        .http2_keepalive_timeout(Some(PING_EVERY))
+}
+
+/// Serves until shutdown, and then for as long as peers need to let go, but no longer than [`GRACE`].
+pub(crate) async fn serve_grpc(server: Router, listener: TcpListener, shutdown: Shutdown) -> Result<()> {
+    let (ended, late) = (shutdown.clone(), shutdown);
+    let serving = server
+        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move { ended.wait().await });
+    tokio::select! {
+        served = serving => Ok(served?),
+        () = async { late.wait().await; tokio::time::sleep(GRACE).await } => {
+            tracing::warn!("ending with connections open: their peers did not let go");
+            Ok(())
+        }
+    }
+}
+
 /// Binds a listener, or says which address could not be had and what to do.
 pub(crate) async fn bind(address: &str, what: &str) -> Result<TcpListener> {
     TcpListener::bind(address).await.with_context(|| {
-        format!("cannot listen at {address} for {what}: is it taken? choose another with --set network.…=HOST:PORT")
+        format!(
+            "cannot listen at {address} for {what}: choose another address with --set network.…=HOST:PORT"
+        )
     })
 }
 

@@ -42,7 +42,10 @@ pub(crate) async fn run(arguments: Args) -> Result<()> {
         Ok(reply) => print_learner(reply),
         Err(error) => println!("learner  not reached: {error:#}"),
     }
-    anyhow::ensure!(replay.is_ok() || learner.is_ok(), "no role answers: is the cluster running?");
+    anyhow::ensure!(
+        replay.is_ok() || learner.is_ok(),
+        "no role answers: is the cluster running? (`getup train` shows its waits itself)"
+    );
     Ok(())
 }
 

@@ -38,7 +38,8 @@ pub(crate) struct Args {
     /// Every random draw comes from it. [default: 0]
     #[arg(long)]
     seed: Option<u64>,
-    /// Env steps of the whole run. [default: until the curriculum ends]
+    /// Env steps of the whole run; looked at once updates begin, after the uniform ones. [default: until the
+    /// curriculum ends]
     #[arg(long)]
     steps: Option<u64>,
     /// One lane thread and a fixed interleaving: the same seed repeats evaluations.jsonl byte for byte on the same
@@ -63,7 +64,7 @@ pub(crate) fn run(mut arguments: Args) -> Result<()> {
     } else {
         role.run(train(&config, &role, &folder, arguments.resume))
     }?;
-    conclude(ending, &folder, &arguments);
+    conclude(ending, &folder);
     Ok(())
 }
 
@@ -90,10 +91,7 @@ fn prepare(arguments: &mut Args) -> Result<(Config, RunFolder)> {
         );
     }
     name_after_folder(&mut config, &path);
-    let folder = RunFolder::new(path);
-    folder.create()?;
-    write_atomically(&folder.config(), config.to_toml()?.as_bytes())?;
-    Ok((config, folder))
+    Ok((config, RunFolder::new(path)))
 }
 
 fn prepare_resumed(arguments: &mut Args) -> Result<(Config, RunFolder)> {
@@ -127,8 +125,21 @@ fn prepare_resumed(arguments: &mut Args) -> Result<(Config, RunFolder)> {
             config.preset
         );
     }
-    write_atomically(&folder.config(), config.to_toml()?.as_bytes())?;
+    let of_the_run =
+        ConfigArgs { config: arguments.config.config.clone(), ..ConfigArgs::default() }.load()?;
+    ensure!(
+        config.seed == of_the_run.seed,
+        "--resume: the run in {} has seed {}, not {}: its evaluations are drawn from it; train a new run",
+        folder.root().display(),
+        of_the_run.seed,
+        config.seed
+    );
     Ok((config, folder))
+}
+
+/// Notes the configuration, once everything has accepted it: a refused change leaves the run as it was.
+fn note_config(config: &Config, folder: &RunFolder) -> Result<()> {
+    Ok(write_atomically(&folder.config(), config.to_toml()?.as_bytes())?)
 }
 
 /// A run that has no name of its own is called like its folder.
@@ -144,12 +155,14 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bool) -
     let device = device::open(config.learner.device, config.learner.effective_threads())?;
     serve_metrics(config, role).await?;
     let spec = config.run_spec()?;
+    folder.create()?;
     let store = open_store(config, role, folder)?;
     let (hub, incarnation) = make_hub(config, role, folder)?;
     let mut trainer =
         make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, resume)?;
     let options = sample_options(config, incarnation);
     let mut source = LocalSource::new(Arc::clone(&store), options, "learner", role.shutdown.clone())?;
+    note_config(config, folder)?;
     let bar = progress::Progress::start(role, config, Arc::clone(&hub));
 
     let identity = Identity::new(&config.actor.name, config.seed);
@@ -198,7 +211,7 @@ async fn serve_metrics(config: &Config, role: &Role) -> Result<()> {
 }
 
 /// Says how training ended and what to try next.
-fn conclude(ending: Ending, folder: &RunFolder, arguments: &Args) {
+fn conclude(ending: Ending, folder: &RunFolder) {
     let shown = folder.root().display();
     match ending {
         Ending::Curriculum(Outcome::FloorPassed { beta }) => {
@@ -207,7 +220,7 @@ fn conclude(ending: Ending, folder: &RunFolder, arguments: &Args) {
         Ending::Curriculum(Outcome::StageOutlasted { beta }) => {
             println!("Done: the curriculum is over, the weakest stage passed has β = {beta:.3}.");
         }
-        Ending::Steps(steps) => println!("Done: {steps} env steps."),
+        Ending::Steps(steps) => println!("Done: {steps} env steps{}.", last_evaluation(folder)),
         Ending::Shutdown => {
             println!("Saved. Go on with: {} train --resume --run {shown}", program());
             return;
@@ -216,10 +229,20 @@ fn conclude(ending: Ending, folder: &RunFolder, arguments: &Args) {
     let model = if folder.model("best").exists() { "best" } else { "last" };
     println!("Evaluations: {}", folder.evaluations().display());
     println!("Try it on unseen falls: {} evaluate {}", program(), folder.model(model).display());
-    if matches!(ending, Ending::Steps(_)) {
-        let more = arguments.steps.unwrap_or(0).saturating_mul(2);
+    if let Ending::Steps(steps) = ending {
+        let more = steps.saturating_mul(2);
         println!("Train it further: {} train --resume --run {shown} --steps {more}", program());
     }
+}
+
+/// What the newest evaluation found, where there is one.
+fn last_evaluation(folder: &RunFolder) -> String {
+    let text = std::fs::read_to_string(folder.evaluations()).unwrap_or_default();
+    let line = text.lines().last().and_then(|line| serde_json::from_str::<serde_json::Value>(line).ok());
+    let found = line.and_then(|line| Some((line["mean"].as_f64()?, line["min"].as_f64()?)));
+    found.map_or_else(String::new, |(mean, min)| {
+        format!(", last evaluation: mean return {mean:.1}, minimum {min:.1}")
+    })
 }
 
 /// How this program was called.

@@ -59,7 +59,14 @@ fn a_run_is_interrupted_resumed_and_ended_by_its_steps() {
     for key in ["rise_rate", "stand_rate", "mean_return", "min_return", "beta", "episodes", "seed"] {
         assert!(report[key].is_number(), "{key} in {report}");
     }
-    // Past its steps already: it saves and ends.
+    for (arguments, expected) in
+        [(["--set", "sac.hidden=[8, 8]"], "run's own configuration"), (["--seed", "7"], "has seed 0, not 7")]
+    {
+        let mut refused = getup(&["train", "--run", "run", "--resume"]);
+        let error = fail(refused.args(arguments).current_dir(folder.path()));
+        assert!(error.contains(expected), "{error}");
+    }
+    // What was refused changed nothing. Past its steps already: it saves and ends.
     let mut resume = getup(&["train", "--run", "run", "--resume", "--steps", "10"]);
     assert!(succeed(resume.current_dir(folder.path())).contains("Done:"));
 }
@@ -145,12 +152,24 @@ fn nonsense_is_answered_with_the_thing_the_value_and_the_way_out() {
         (&["--set", "curriculum.n_min=9", "--set", "curriculum.n_max=3"], "at most curriculum.n_max"),
         (&["--resume", "--run", "nowhere"], "there is no run in nowhere"),
         (&["--config", "nowhere.toml"], "cannot read the configuration nowhere.toml"),
+        (&["--set", "preset=paper"], "choose it with --preset paper"),
+        (&["--set", "sac.uniform_steps=2000000"], "sac.uniform_steps = 2000000: at most replay.capacity"),
     ] {
         let stderr = said(arguments);
         assert!(stderr.contains(expected), "{arguments:?} said:\n{stderr}");
     }
     let error = fail(&mut getup(&["evaluate", "Cargo.toml"]));
-    assert!(error.contains("not a getup model"), "{error}");
+    assert!(error.contains("Cargo.toml: not a getup model"), "{error}");
+    use std::os::unix::ffi::OsStrExt;
+    let odd = std::ffi::OsStr::from_bytes(b"\xff");
+    succeed(
+        getup(&["doctor", "--preset", "smoke", "--set", "network.replay=127.0.0.1:0"])
+            .args(["--set", "network.learner=127.0.0.1:0", "--set", "network.replay_metrics=127.0.0.1:0"])
+            .args(["--set", "network.learner_metrics=127.0.0.1:0"])
+            .env("ODD", odd),
+    );
+    let error = fail(getup(&["status"]).env("GETUP_RUN", odd));
+    assert!(error.contains("GETUP_RUN"), "{error}");
     let error = fail(&mut getup(&["evaluate", "nowhere.safetensors"]));
     assert!(error.contains("nowhere.safetensors"), "{error}");
     assert!(folder.path().read_dir().unwrap().next().is_none(), "a refused command leaves nothing behind");

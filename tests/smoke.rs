@@ -91,10 +91,10 @@ fn three_processes_train_promote_survive_a_kill_finish_and_end_with_0() {
     assert!(!learner.wait(LIMIT).success());
     // The same run, now with a threshold that nobody passes: the stage outlasts its limit.
     let mut learner = cluster.start("learner", 1_000.0);
-    let resumed = wait_for("the learner resumes", LIMIT, || cluster.learner_metric("env_steps"));
-    assert!(resumed >= before, "{resumed} env steps after the kill, {before} in the checkpoint");
+    wait_for_at_least(&cluster, "env_steps", before);
     assert!(cluster.learner_metric("stage").unwrap() >= 1.0, "the curriculum goes on where it was");
     wait_for_at_least(&cluster, "finished", 1.0);
+    assert!(learner.log().contains("StageOutlasted"), "{}", learner.log());
     let status = cluster.status().unwrap();
     assert_eq!(status["learner"]["state"], "finished");
     for process in [&mut actor, &mut learner, &mut replay] {
@@ -110,6 +110,30 @@ fn three_processes_train_promote_survive_a_kill_finish_and_end_with_0() {
         let status = process.wait(Duration::from_secs(10));
         assert!(status.success(), "{status}:\n{}", process.log());
     }
+}
+
+#[test]
+fn a_role_whose_peers_are_away_or_frozen_says_so_and_ends_with_0_when_asked() {
+    let cluster = Cluster::new();
+    let mut learner = cluster.start("learner", 1.0);
+    let mut actor = cluster.start("actor", 1.0);
+    let waiting = wait_for("the learner says that it waits for the replay", LIMIT, || {
+        let status = cluster.status()?;
+        let waiting = status["learner"]["waiting"].as_str()?.to_owned();
+        (waiting.contains("replay") && !waiting.contains("(for 0 s)")).then_some(waiting)
+    });
+    assert!(waiting.contains(cluster.address("replay")), "{waiting}");
+    // A connection that never says a word, and an actor that is frozen while it is connected.
+    let silent = std::net::TcpStream::connect(cluster.address("learner")).unwrap();
+    actor.signal("STOP");
+    learner.signal("TERM");
+    let status = learner.wait(Duration::from_secs(10));
+    assert!(status.success(), "{status}:\n{}", learner.log());
+    drop(silent);
+    actor.signal("CONT");
+    actor.signal("TERM");
+    let status = actor.wait(Duration::from_secs(10));
+    assert!(status.success(), "{status}:\n{}", actor.log());
 }
 
 fn last_checkpoint_env_steps(folder: &Path) -> f64 {

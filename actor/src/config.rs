@@ -55,7 +55,9 @@ pub enum ConfigError {
         lanes: usize,
     },
     /// Not a duration.
-    #[error("actor.drain_seconds is {0}: it must be between 0 and 3600")]
+    #[error(
+        "actor.drain_seconds is {0}: it must be between 0 and 8, for a shutdown takes ten seconds at most"
+    )]
     Drain(f64),
 }
 
@@ -80,7 +82,7 @@ impl ActorConfig {
         if self.threads > self.lanes {
             return Err(ConfigError::Threads { threads: self.threads, lanes: self.lanes });
         }
-        if !(0.0..=3600.0).contains(&self.drain_seconds) {
+        if !(0.0..=8.0).contains(&self.drain_seconds) {
             return Err(ConfigError::Drain(self.drain_seconds));
         }
         Ok(())

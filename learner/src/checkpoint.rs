@@ -81,6 +81,8 @@ pub struct Progress {
     pub store_env_steps: u64,
     /// Env steps at which the next evaluation is due.
     pub next_evaluation: u64,
+    /// Whether one was offered and is not reported: a resumed learner offers it again.
+    pub evaluation_owed: bool,
 }
 
 /// A checkpoint in memory.
@@ -191,6 +193,8 @@ impl Checkpoint {
         for path in list(folder)?.into_iter().rev() {
             match Self::load(&path) {
                 Ok(checkpoint) => return Ok(Some(checkpoint)),
+                // Not damaged: going back behind it would lose what it holds.
+                Err(error @ CheckpointError::Version { .. }) => return Err(error),
                 Err(error) => {
                     tracing::warn!(%error, "checkpoint passed over");
                     first_error.get_or_insert(error);
@@ -320,7 +324,13 @@ mod tests {
         let shape = TaskShape { observation: 11, action: 4, unnormalized: vec![10] };
         let config = SacConfig { hidden: vec![32, 32], normalize_observations: true, ..SacConfig::default() };
         let curriculum = Curriculum::new(CurriculumConfig::default());
-        let progress = Progress { env_steps: 1234, store: 7, store_env_steps: 1200, next_evaluation: 20_000 };
+        let progress = Progress {
+            env_steps: 1234,
+            store: 7,
+            store_env_steps: 1200,
+            next_evaluation: 20_000,
+            evaluation_owed: true,
+        };
         let mut sac = Sac::new(&shape, &config, 9, Device::Cpu);
         train(&mut sac, &shape, 0, 50);
         Checkpoint::take(&sac, &curriculum, &progress).save(folder.path(), 3).unwrap();

@@ -42,7 +42,7 @@ pub struct Evaluation {
 /// What the training thread tells of itself.
 #[derive(Clone, Debug, Default)]
 pub struct Standing {
-    /// "waiting", "training", "finished", "failed".
+    /// "waiting", "training", "finished".
     pub state: &'static str,
     /// Env steps of the run.
     pub env_steps: u64,

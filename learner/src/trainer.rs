@@ -155,11 +155,11 @@ impl Trainer {
             folder,
             metrics,
         };
-        if trainer.ending.is_some() {
+        if matches!(trainer.ending, Some(Ending::Curriculum(_))) {
             trainer.publish_final()?;
         } else {
             let policy = trainer.publish();
-            if !resumed {
+            if !resumed || trainer.progress.evaluation_owed {
                 trainer.offer(policy);
             }
         }
@@ -221,7 +221,10 @@ impl Trainer {
             self.progress.next_evaluation = (self.progress.env_steps / every + 1) * every;
             let policy = self.publish();
             self.offer(policy);
-        } else if self.sac.updates().is_multiple_of(self.config.learner.publish_every) {
+        } else if self.sac.updates() == 1
+            || self.sac.updates().is_multiple_of(self.config.learner.publish_every)
+        {
+            // The first update ends the uniform actions.
             self.publish();
         }
         if self.config.steps.is_some_and(|steps| self.progress.env_steps >= steps) {
@@ -239,6 +242,7 @@ impl Trainer {
     /// Takes every evaluation that was reported, in order, and lets the curriculum decide.
     pub fn take_reports(&mut self) -> Result<(), TrainError> {
         while let Some((evaluation, episodes)) = self.hub.take_reported() {
+            self.progress.evaluation_owed = self.hub.outstanding() > 0;
             self.evaluated(&evaluation, &episodes)?;
         }
         Ok(())
@@ -246,6 +250,7 @@ impl Trainer {
 
     /// The end of training: the last models and a checkpoint on disk, the final policy broadcast.
     pub fn finish(&mut self) -> Result<Ending, TrainError> {
+        self.take_reports()?;
         let ending = self.ending.unwrap_or(Ending::Shutdown);
         let last = self.describe(self.sac.policy(), self.curriculum.beta());
         last.save(self.folder.model("last"))?;

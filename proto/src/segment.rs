@@ -50,6 +50,9 @@ pub struct EpisodeEnd {
     pub tags: BTreeMap<String, String>,
 }
 
+/// What an episode's end may say in words, in bytes.
+const MAX_END_BYTES: usize = 4096;
+
 /// Why a segment is refused.
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]
 pub enum SegmentError {
@@ -138,6 +141,12 @@ pub enum SegmentError {
         /// NaN or an infinity.
         value: f32,
     },
+    /// More to say of an episode's end than anybody has.
+    #[error("an episode's end has {bytes} bytes of reason and tags: at most {MAX_END_BYTES} are taken")]
+    EndBytes {
+        /// Of both together.
+        bytes: usize,
+    },
     /// NaN or infinity as an episode's return.
     #[error("an episode's return is {0}: drop the episode, its simulation diverged")]
     Return(f32),
@@ -148,7 +157,7 @@ impl SegmentError {
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Sequence | Self::Counts { .. } | Self::End { .. } | Self::Version => "inconsistent",
-            Self::Steps { .. } => "length",
+            Self::Steps { .. } | Self::EndBytes { .. } => "length",
             Self::Columns { .. } | Self::Dimensions { .. } => "dimensions",
             Self::Checksum { .. } => "checksum",
             Self::NonFinite { .. } | Self::Return(_) => "non_finite",
@@ -274,10 +283,13 @@ impl Segment {
                 return Err(SegmentError::NonFinite { column: column.name.clone(), row, place, value });
             }
         }
-        match &self.end {
-            Some(end) if !end.episode_return.is_finite() => Err(SegmentError::Return(end.episode_return)),
-            _ => Ok(()),
+        let Some(end) = &self.end else { return Ok(()) };
+        if !end.episode_return.is_finite() {
+            return Err(SegmentError::Return(end.episode_return));
         }
+        let tags = end.tags.iter().map(|(name, value)| name.len() + value.len()).sum::<usize>();
+        let bytes = end.reason.len() + tags;
+        if bytes > MAX_END_BYTES { Err(SegmentError::EndBytes { bytes }) } else { Ok(()) }
     }
 }
 

@@ -63,6 +63,9 @@ impl Drop for Permit {
     }
 }
 
+/// A wait under way, and when its reason was brought up to date.
+pub(crate) type Waiting = Option<(WaitGuard, Instant)>;
+
 impl Gate {
     pub(crate) fn new(limiter: Limiter, waits: Waits) -> Arc<Self> {
         let inner = Inner { limiter, writers: HashMap::new(), samplers: HashMap::new() };
@@ -106,22 +109,22 @@ impl Gate {
         Ok(true)
     }
 
-    /// Waits until a sample of this size might be let through. False when `cancelled` or `patience` ends the wait.
+    /// Waits until a sample of this size might be let through; `wait` goes on over several calls. False when `cancelled` or `patience` ends the wait.
     pub(crate) fn wait_to_sample(
         &self,
         batch: u64,
         patience: Duration,
+        wait: &mut Waiting,
         cancelled: impl Fn() -> bool,
     ) -> bool {
         let started = Instant::now();
-        let mut wait = None;
         let mut inner = self.lock();
         while let Some(blocked) = inner.limiter.blocks_sample(batch) {
             let left = patience.saturating_sub(started.elapsed());
             if left.is_zero() || cancelled() {
                 return false;
             }
-            self.explain(&mut wait, "sampler", || inner.reason(&blocked, &inner.writers));
+            self.explain(wait, "sampler", || inner.reason(&blocked, &inner.writers));
             let tick = left.min(CANCEL_TICK);
             inner = self.moved.wait_timeout(inner, tick).unwrap_or_else(PoisonError::into_inner).0;
         }
@@ -217,12 +220,7 @@ impl Gate {
             .map_or_else(String::new, |wait| wait.to_string())
     }
 
-    fn explain(
-        &self,
-        wait: &mut Option<(WaitGuard, Instant)>,
-        what: &'static str,
-        reason: impl FnOnce() -> String,
-    ) {
+    fn explain(&self, wait: &mut Waiting, what: &'static str, reason: impl FnOnce() -> String) {
         match wait {
             Some((_, updated)) if updated.elapsed() < REASON_TICK => {}
             Some((guard, updated)) => {

@@ -1,5 +1,6 @@
 //! Sampling a replay service: [`RemoteSource`], and [`describe`].
 
+use crate::gate::Waiting;
 use crate::minibatch::{Minibatch, SampleOptions};
 use crate::source::{MinibatchSource, SampleError};
 use getup_proto::v1::replay_client::ReplayClient;
@@ -35,6 +36,8 @@ pub struct RemoteSource {
     /// Why there is none.
     reason: Reason,
     waits: Waits,
+    /// Since the last minibatch.
+    wait: Waiting,
     shutdown: Shutdown,
 }
 
@@ -74,15 +77,13 @@ impl RemoteSource {
             streams: 0,
         };
         runtime.spawn(fetching.run());
-        Self { queue, taken, reason, waits, shutdown }
+        Self { queue, taken, reason, waits, wait: None, shutdown }
     }
 }
 
 impl MinibatchSource for RemoteSource {
     fn poll(&mut self, patience: Duration) -> Result<Option<Minibatch>, SampleError> {
         let started = Instant::now();
-        let mut wait = None;
-        let mut explained = started;
         loop {
             if self.shutdown.is_triggered() {
                 return Err(SampleError::Shutdown);
@@ -92,18 +93,19 @@ impl MinibatchSource for RemoteSource {
                 Ok(minibatch) => {
                     // The task may just have ended with an error, which is then next in the queue.
                     let _ = self.taken.send(());
+                    self.wait = None;
                     return minibatch.map(Some);
                 }
-                Err(RecvTimeoutError::Disconnected) => return Err(SampleError::Shutdown),
+                Err(RecvTimeoutError::Disconnected) => return Err(SampleError::Ended),
                 Err(RecvTimeoutError::Timeout) if left.is_zero() => return Ok(None),
                 Err(RecvTimeoutError::Timeout) => {}
             }
             let reason = || lock(&self.reason).clone();
-            match &wait {
-                None => wait = Some(self.waits.begin("learner", reason())),
-                Some(guard) if explained.elapsed() >= REASON_TICK => {
+            match &mut self.wait {
+                None => self.wait = Some((self.waits.begin("learner", reason()), Instant::now())),
+                Some((guard, explained)) if explained.elapsed() >= REASON_TICK => {
                     guard.set_reason(reason());
-                    explained = Instant::now();
+                    *explained = Instant::now();
                 }
                 Some(_) => {}
             }

@@ -4,6 +4,7 @@
 //! cannot tell which it has.
 
 use crate::error::StoreError;
+use crate::gate::Waiting;
 use crate::minibatch::{Minibatch, OptionsError, SampleOptions};
 use crate::sampler::Sampler;
 use crate::store::Store;
@@ -45,6 +46,9 @@ pub enum SampleError {
     /// The store failed.
     #[error(transparent)]
     Store(#[from] StoreError),
+    /// A defect of this program.
+    #[error("the task that fetches minibatches has ended: see the log")]
+    Ended,
     /// The service refuses, and would again.
     #[error("replay at {endpoint} refuses to be sampled: {reason}")]
     Refused {
@@ -64,6 +68,8 @@ pub struct LocalSource {
     shutdown: Shutdown,
     /// Among the samplers at the gate.
     id: u64,
+    /// Since the last minibatch.
+    wait: Waiting,
 }
 
 impl LocalSource {
@@ -81,7 +87,7 @@ impl LocalSource {
         store.check_options(&options)?;
         let id = NEXT.fetch_add(1, Ordering::Relaxed);
         store.gate().sampler_came(id, name);
-        Ok(Self { store, sampler: Sampler::uniform(options.seed), options, shutdown, id })
+        Ok(Self { store, sampler: Sampler::uniform(options.seed), options, shutdown, id, wait: None })
     }
 
     /// The sampler's state, to be saved in a checkpoint.
@@ -107,11 +113,12 @@ impl LocalSource {
                 return Err(SampleError::Shutdown);
             }
             if let Some(minibatch) = self.store.try_sample(&mut self.sampler, &self.options)? {
+                self.wait = None;
                 return Ok(Some(minibatch));
             }
             // Another sampler may be quicker than this one after the wait.
             let cancelled = || cancelled() || self.shutdown.is_triggered();
-            if !gate.wait_to_sample(self.options.batch as u64, patience, cancelled) {
+            if !gate.wait_to_sample(self.options.batch as u64, patience, &mut self.wait, cancelled) {
                 return if self.shutdown.is_triggered() { Err(SampleError::Shutdown) } else { Ok(None) };
             }
         }

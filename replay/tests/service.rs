@@ -97,7 +97,7 @@ fn what_is_wrong_is_refused_with_its_reason_and_changes_nothing() {
             InvalidArgument,
             "`reward` holds inf",
         ),
-        (vec![hello(&replay.spec, 1), Message::Segment(damaged)], InvalidArgument, "checksum"),
+        (vec![hello(&replay.spec, 1), Message::Segment(damaged)], Code::DataLoss, "checksum"),
         (with(&|s| s.steps = 9), InvalidArgument, "has 9 steps"),
         (with(&|s| s.terminal = true), InvalidArgument, "end is inconsistent"),
         (with(&|s| s.writer = 2), InvalidArgument, "a segment of writer 2"),

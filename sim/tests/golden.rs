@@ -26,7 +26,9 @@ fn compare(ours: &[f64], theirs: &[f64]) -> (f64, usize) {
     assert_eq!(ours.len(), theirs.len());
     let differences = ours.iter().zip(theirs).map(|(a, b)| (a - b).abs());
     let differ = ours.iter().zip(theirs).filter(|(a, b)| a != b).count();
-    (differences.fold(0.0, f64::max), differ)
+    // A NaN differs by more than any number.
+    let largest = differences.map(|d| if d.is_nan() { f64::INFINITY } else { d }).fold(0.0, f64::max);
+    (largest, differ)
 }
 
 fn conforms(name: &str) {

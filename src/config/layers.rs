@@ -2,6 +2,8 @@
 //!
 //! The known settings are those of the default configuration: nothing is listed twice.
 
+use std::ffi::OsString;
+
 use anyhow::{Context, Result, anyhow, bail};
 use toml::{Table, Value};
 
@@ -16,7 +18,9 @@ pub(super) const PRESETS: [(&str, &str); 4] = [
 ];
 
 /// Environment variables with our prefix that are no settings.
-const NOT_SETTINGS: [&str; 2] = ["GETUP_TEST_", "GETUP_PEERS_"];
+const NOT_SETTINGS: [&str; 3] = ["GETUP_TEST_", "GETUP_PEERS_", PRESET_VARIABLE];
+/// Chooses the preset where the command line does not.
+pub(super) const PRESET_VARIABLE: &str = "GETUP_PRESET";
 
 /// The layers so far, merged.
 pub(crate) struct Layers {
@@ -54,8 +58,12 @@ impl Layers {
     }
 
     /// Variables such as `GETUP_SAC__BATCH=256`.
-    pub(crate) fn environment(&mut self, variables: impl Iterator<Item = (String, String)>) -> Result<()> {
-        let mut settings: Vec<(String, String)> = variables
+    pub(crate) fn environment(
+        &mut self,
+        variables: impl Iterator<Item = (OsString, OsString)>,
+    ) -> Result<()> {
+        let ours = variables.filter_map(|(name, value)| Some((name.into_string().ok()?, value)));
+        let mut settings: Vec<(String, OsString)> = ours
             .filter(|(name, _)| {
                 name.starts_with("GETUP_") && !NOT_SETTINGS.iter().any(|other| name.starts_with(other))
             })
@@ -63,6 +71,7 @@ impl Layers {
         settings.sort();
         for (name, value) in settings {
             let key = name["GETUP_".len()..].to_lowercase().replace("__", ".");
+            let value = value.into_string().map_err(|value| anyhow!("{name}: {value:?} is not UTF-8"))?;
             self.set(&name, &format!("{key}={value}"))?;
         }
         Ok(())
@@ -74,6 +83,10 @@ impl Layers {
             bail!("{source}: {assignment:?} is not of the form KEY=VALUE, such as sac.batch=256");
         };
         let (key, text) = (key.trim(), text.trim());
+        if key == "preset" {
+            bail!("{source}: a preset is a layer of its own: choose it with --preset {text}");
+        }
+        check_known(source, "", &nested(key, Value::Boolean(true)), &self.known)?;
         let as_toml =
             format!("value = {text}").parse::<Table>().ok().and_then(|mut table| table.remove("value"));
         let as_text = Value::String(text.to_owned());

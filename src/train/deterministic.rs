@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::Result;
-use getup_actor::evaluate::Evaluator;
+use getup_actor::evaluate::{EvaluateError, Evaluator};
 use getup_actor::identity::Identity;
 use getup_actor::lanes::{LaneGroup, LaneSettings};
 use getup_actor::link::{Heartbeat, Lease, PolicyUpdate};
@@ -22,17 +22,19 @@ use getup_replay::{SampleOptions, Sampler, Store};
 use getup_sim::GetUp;
 use tokio::sync::watch;
 
-use super::open_store;
 use super::progress::Progress;
+use super::{note_config, open_store};
 use crate::config::Config;
 use crate::learner::{make_hub, make_trainer, sample_options};
 use crate::role::Role;
 
 pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bool) -> Result<Ending> {
     let device = device::open(config.learner.device, 1)?;
+    folder.create()?;
     let store = open_store(config, role, folder)?;
     let (hub, incarnation) = make_hub(config, role, folder)?;
     let trainer = make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, resume)?;
+    note_config(config, folder)?;
     let bar = Progress::start(role, config, Arc::clone(&hub));
     // The writer's id is part of every random draw of the lanes: here it is the number of the start.
     let identity = Identity { writer: incarnation, ..Identity::new(&config.actor.name, config.seed) };
@@ -65,7 +67,7 @@ pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bo
     while turns.trainer.ending().is_none() && !role.shutdown.is_triggered() {
         turns.play()?;
         turns.update(role)?;
-        turns.evaluate()?;
+        turns.evaluate(role)?;
         turns.take_policy()?;
     }
     let ending = turns.trainer.finish()?;
@@ -112,14 +114,19 @@ impl Turns {
     }
 
     /// Every evaluation that is offered, at once.
-    fn evaluate(&mut self) -> Result<()> {
+    fn evaluate(&mut self, role: &Role) -> Result<()> {
         loop {
             let beat = Heartbeat { actor: self.name.clone(), ..Heartbeat::default() };
             let reply = self.hub.heartbeat(beat.into(), Instant::now())?;
             let Some(lease) = reply.lease.map(Lease::parse).transpose()? else { return Ok(()) };
-            let on = |_| ControlFlow::Continue(());
-            let episodes =
-                self.evaluator.evaluate(&lease.update.policy, lease.update.beta, &lease.seeds, on)?;
+            let go_on = |_| {
+                if role.shutdown.is_triggered() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            };
+            let (policy, beta) = (&lease.update.policy, lease.update.beta);
+            let episodes = match self.evaluator.evaluate(policy, beta, &lease.seeds, go_on) {
+                Err(EvaluateError::Ended) => return Ok(()),
+                episodes => episodes?,
+            };
             let episodes = episodes.iter().map(|episode| episode.result().into()).collect();
             self.hub.report(v1::EvaluationReport { lease: lease.id, actor: self.name.clone(), episodes })?;
             self.trainer.take_reports()?;

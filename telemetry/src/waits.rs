@@ -160,7 +160,9 @@ fn log_long_waits(table: &Weak<Mutex<Table>>) {
     loop {
         thread::sleep(TICK);
         let Some(table) = table.upgrade() else { return };
-        for wait in (Waits { table }).table().due(Instant::now()) {
+        // Not under the lock: whoever reads the log may be slow.
+        let due = Waits { table }.table().due(Instant::now());
+        for wait in due {
             tracing::info!(what = wait.what, seconds = wait.seconds, "{wait}");
         }
     }

@@ -36,6 +36,10 @@ const CUDA_WHEELS: &[&str] = &[
 /// What benchmarks compare with: PyTorch whole, with NumPy for its tensors.
 const PEER_REQUIREMENTS: &[&str] = &["torch==2.11.0", "numpy==2.3.5"];
 
+/// The variables that tell build scripts where the libraries are, and the folder of each in `.native`.
+pub(crate) const BUILD_VARIABLES: [(&str, &str); 2] =
+    [("LIBTORCH", "wheels/torch"), ("MUJOCO_DYNAMIC_LINK_DIR", "mujoco")];
+
 /// The repository's root.
 pub(crate) fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask lies in the root").to_owned()
@@ -53,6 +57,7 @@ pub(crate) fn peers_python() -> PathBuf {
 /// Installs the wheels and writes `.cargo/native.toml`, where they are missing or of other versions. Without `cuda`
 /// an installation with CUDA's libraries is left as it is.
 pub(crate) fn set_up(cuda: bool) -> Result<()> {
+    prerequisites::check()?;
     let with_cuda = [WHEELS, CUDA_WHEELS].concat();
     let installed = fs::read_to_string(native().join("wheels/installed")).unwrap_or_default();
     let has_cuda = installed == with_cuda.join("\n");
@@ -81,7 +86,6 @@ pub(crate) fn set_up_peers() -> Result<()> {
 
 /// Installs wheels without their dependencies, all or none.
 fn install_wheels(wheels: &[&str], what: &str) -> Result<()> {
-    prerequisites::check()?;
     let folder = native().join("wheels");
     println!("Installing {what} into {}", folder.display());
     let pip = pip()?;
@@ -103,8 +107,9 @@ fn install_wheels(wheels: &[&str], what: &str) -> Result<()> {
 fn pip() -> Result<PathBuf> {
     let venv = native().join("venv");
     let python = venv.join("bin/python");
-    if !python.exists() {
-        run(Command::new("python3").args(["-m", "venv"]).arg(&venv))?;
+    let works = Command::new(&python).args(["-m", "pip", "--version"]).output();
+    if !works.is_ok_and(|output| output.status.success()) {
+        run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&venv))?;
     }
     Ok(python)
 }
@@ -113,12 +118,13 @@ fn pip() -> Result<PathBuf> {
 fn link_mujoco() -> Result<()> {
     let folder = native().join("mujoco");
     let link = folder.join("libmujoco.so");
-    if link.exists() {
+    let target = native().join(format!("wheels/mujoco/libmujoco.so.{MUJOCO}"));
+    if fs::read_link(&link).is_ok_and(|old| old == target) {
         return Ok(());
     }
     fs::create_dir_all(&folder)?;
+    // Not there, or the link of another place.
     let _ = fs::remove_file(&link);
-    let target = native().join(format!("wheels/mujoco/libmujoco.so.{MUJOCO}"));
     #[cfg(unix)]
     std::os::unix::fs::symlink(&target, &link)
         .with_context(|| format!("cannot link {} to {}", link.display(), target.display()))?;
@@ -134,11 +140,12 @@ fn write_cargo_settings() -> Result<()> {
         .filter(|folder| folder.is_dir())
         .flat_map(|folder| ["-C".into(), format!("link-arg=-Wl,-rpath,{}", folder.display()).into()])
         .collect();
-    let text = |path: PathBuf| toml::Value::String(path.display().to_string());
+    let variables: toml::Table = BUILD_VARIABLES
+        .into_iter()
+        .map(|(name, folder)| (name.to_owned(), native().join(folder).display().to_string().into()))
+        .collect();
     let settings = toml::toml! {
-        [env]
-        LIBTORCH = (text(wheels.join("torch")))
-        MUJOCO_DYNAMIC_LINK_DIR = (text(native().join("mujoco")))
+        env = (variables)
         [build]
         rustflags = (flags.clone())
         rustdocflags = (flags)

@@ -4,11 +4,15 @@ use std::process::Command;
 
 use anyhow::{Context, Result, bail};
 
-use crate::native::{peers_python, root, run};
+use crate::native::{self, peers_python, root, run};
 
 fn cargo() -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     command.current_dir(root());
+    // Cargo gave this process the paths that held before it wrote them anew: let the next one read the file.
+    for (name, _) in native::BUILD_VARIABLES {
+        command.env_remove(name);
+    }
     command
 }
 

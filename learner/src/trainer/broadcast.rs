@@ -45,6 +45,7 @@ impl Trainer {
     /// Offers a policy for evaluation.
     pub(super) fn offer(&mut self, policy: Arc<v1::PolicyUpdate>) {
         self.evaluated_updates = self.sac.updates();
+        self.progress.evaluation_owed = true;
         self.hub.offer(Evaluation { policy, updates: self.sac.updates() });
     }
 

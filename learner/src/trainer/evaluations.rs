@@ -116,7 +116,9 @@ impl Trainer {
             model.save(self.folder.model("best"))?;
         }
         if decision != Decision::Ignore && decision != Decision::Stay {
+            // On disk before anybody hears of the next stage: the curriculum never goes back.
             self.checkpoint();
+            self.checkpoints.finish()?;
         }
         if matches!(decision, Decision::Promote { .. }) {
             self.publish();

@@ -3,7 +3,7 @@
 use super::committer::Job;
 use super::{failed, shutting_down};
 use crate::store::Store;
-use getup_proto::{Segment, v1};
+use getup_proto::{Segment, SegmentError, v1};
 use getup_telemetry::Shutdown;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -126,8 +126,14 @@ impl AppendStream {
                 "a stream has one hello, and then segments: send a segment".to_owned(),
             ));
         };
-        let segment = Segment::parse(segment, self.visit.store.spec())
-            .map_err(|error| refused(error.kind(), error.to_string()))?;
+        let segment = Segment::parse(segment, self.visit.store.spec()).map_err(|error| {
+            let status = refused(error.kind(), error.to_string());
+            match error {
+                // Worth another attempt, unlike the rest.
+                SegmentError::Checksum { .. } => Status::data_loss(status.message()),
+                _ => status,
+            }
+        })?;
         if segment.writer != self.visit.writer {
             let (theirs, ours) = (segment.writer, self.visit.writer);
             let text =

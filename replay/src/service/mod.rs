@@ -26,7 +26,7 @@ use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status, Streaming};
 
 /// How long streams may take to end after the shutdown has begun.
-const GRACE: Duration = Duration::from_secs(5);
+const GRACE: Duration = Duration::from_secs(3);
 /// How long a client may take to say hello.
 const HELLO_PATIENCE: Duration = Duration::from_secs(10);
 /// A peer that does not answer pings for this long is gone.
@@ -90,11 +90,11 @@ pub async fn serve(listener: TcpListener, store: Arc<Store>, shutdown: Shutdown)
         committed = &mut committing => return Ok(committed??),
         () = out_of_patience => tracing::warn!("replay ends with streams open: their clients did not let go"),
     }
-    // With the service its end of the queue is gone: the committer ends once it has worked it off.
+    // The committer ends once it has worked off its queue and all streams, which hold the other end, are gone.
     match tokio::time::timeout(GRACE, committing).await {
         Ok(committed) => Ok(committed??),
         Err(_) => {
-            tracing::warn!("replay ends while the disk still takes a commit");
+            tracing::warn!("replay ends before its committer: a stream or the disk holds it up");
             Ok(())
         }
     }
@@ -160,7 +160,7 @@ impl Replay for Service {
 async fn first_message<T>(inbound: &mut Streaming<T>) -> Result<T, Status> {
     match tokio::time::timeout(HELLO_PATIENCE, inbound.message()).await {
         Ok(message) => message?.ok_or_else(no_hello),
-        Err(_) => Err(no_hello()),
+        Err(_) => Err(Status::deadline_exceeded("no hello came in time: connect again")),
     }
 }
 
