@@ -2,7 +2,7 @@
 //!
 //! The statistical tests draw 10,000 initial poses from fixed seeds, so they pass or fail for good. Each critical
 //! value is that of one test at the 1e-4 level: the ninety tests made here would fail a correct sampler on one seed
-//! in a hundred. Landings are counted on 500 falls, and on 10,000 with `GETUP_TEST_FULL=1`.
+//! in a hundred. Landings are counted on as many falls, a minute on two cores.
 
 use std::f64::consts::PI;
 use std::sync::Arc;
@@ -187,8 +187,7 @@ fn every_hinge_is_uniform_apart_from_the_contact_rejection() {
 
 #[test]
 fn falls_take_eighty_limp_steps_and_land_supine_prone_and_on_a_side() {
-    let full = std::env::var_os("GETUP_TEST_FULL").is_some();
-    let count = if full { 10_000 } else { 500 };
+    let count = DRAWS;
     let Falls { falls, landings, .. } = falls::draw(&TaskConfig::default(), count, 4).unwrap();
     assert_eq!(falls.len(), count);
     assert!(falls.iter().all(|fall| fall.limp_steps == 80));

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::*;
-use crate::config::TargetEntropy;
+use crate::config::{Precision, TargetEntropy};
 use crate::parameters::Parameters;
 use serde::Deserialize;
 
@@ -115,9 +115,11 @@ fn toy_config() -> SacConfig {
 }
 
 #[test]
-fn a_toy_task_is_learned_to_its_known_optimum_with_and_without_normalisation() {
-    for normalize_observations in [false, true] {
-        let config = SacConfig { normalize_observations, ..toy_config() };
+fn a_toy_task_is_learned_to_its_known_optimum_normalised_or_not_and_in_both_precisions() {
+    for (normalize_observations, precision) in
+        [(false, Precision::Fp32), (true, Precision::Fp32), (false, Precision::Bf16)]
+    {
+        let config = SacConfig { normalize_observations, precision, ..toy_config() };
         let shape = TaskShape { observation: 1, action: 1, unnormalized: vec![] };
         let mut sac = Sac::new(&shape, &config, 3, Device::Cpu);
         let mut rng = ChaCha8Rng::seed_from_u64(4);
@@ -160,6 +162,24 @@ fn the_actors_forward_pass_agrees_with_the_learners_network_on_every_shape() {
             assert!((ours - theirs).abs() < 1e-5, "{ours} {theirs}");
         }
     }
+}
+
+#[test]
+fn in_bfloat16_the_learners_network_stays_within_its_rounding_of_the_actors() {
+    let shape = TaskShape { observation: 68, action: 21, unnormalized: vec![] };
+    let network = |precision| {
+        let config = SacConfig { hidden: vec![256, 256], precision, ..SacConfig::default() };
+        Sac::new(&shape, &config, 5, Device::Cpu)
+    };
+    let (exact, rounded) = (network(Precision::Fp32), network(Precision::Bf16));
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    let values: Vec<f32> = (0..33 * 68).map(|_| rng.random_range(-1.0..1.0)).collect();
+    let input = Tensor::from_slice(&values).view([33, 68]);
+    let mean = |sac: &Sac| tch::no_grad(|| sac.actor.forward(&input).mean().shallow_clone());
+    let (exact, rounded) = (mean(&exact), mean(&rounded));
+    let error = (&exact - &rounded).abs().max().double_value(&[]);
+    // Eight bits of mantissa over two layers of values around 1.
+    assert!(error > 0.0 && error < 0.02 * exact.abs().max().double_value(&[]).max(1.0), "{error}");
 }
 
 #[test]
