@@ -168,6 +168,7 @@ impl Checkpoint {
         sac.log_temperature = scalars.log_temperature;
         sac.statistics = scalars.statistics;
         sac.rng = scalars.rng;
+        sac.changed();
         Ok(())
     }
 
@@ -296,17 +297,16 @@ mod tests {
 
     fn batch(index: u64, shape: &TaskShape) -> Batch {
         let mut rng = ChaCha8Rng::seed_from_u64(index);
-        let mut column = |width: usize| {
-            let values: Vec<f32> = (0..32 * width).map(|_| rng.random_range(-1.0..1.0)).collect();
-            Tensor::from_slice(&values).view([32, width as i64])
+        let mut column = |width: usize, low: f32, high: f32| -> Vec<f32> {
+            (0..32 * width).map(|_| rng.random_range(low..high)).collect()
         };
         Batch {
-            observation: column(shape.observation),
-            next_observation: column(shape.observation),
-            action: column(shape.action) * 0.3,
-            reward: column(1).squeeze_dim(1),
-            discount: column(1).squeeze_dim(1).abs() * 0.97,
-            beta: column(1).abs() * 0.5 + 0.5,
+            observation: column(shape.observation, -1.0, 1.0),
+            next_observation: column(shape.observation, -1.0, 1.0),
+            action: column(shape.action, -0.3, 0.3),
+            reward: column(1, -1.0, 1.0),
+            discount: column(1, 0.0, 0.97),
+            beta: column(1, 0.5, 1.0),
         }
     }
 
@@ -331,14 +331,14 @@ mod tests {
             next_evaluation: 20_000,
             evaluation_owed: true,
         };
-        let mut sac = Sac::new(&shape, &config, 9, Device::Cpu);
+        let mut sac = Sac::new(&shape, &config, 9, Device::Cpu, 1);
         train(&mut sac, &shape, 0, 50);
         Checkpoint::take(&sac, &curriculum, &progress).save(folder.path(), 3).unwrap();
         train(&mut sac, &shape, 50, 100);
 
         let loaded = Checkpoint::newest(folder.path()).unwrap().unwrap();
         assert_eq!((&loaded.curriculum, &loaded.progress), (&curriculum, &progress));
-        let mut resumed = Sac::new(&shape, &config, 1, Device::Cpu);
+        let mut resumed = Sac::new(&shape, &config, 1, Device::Cpu, 1);
         loaded.restore(&mut resumed).unwrap();
         train(&mut resumed, &shape, 50, 100);
         let end = |sac: &Sac| Checkpoint::take(sac, &curriculum, &progress);
@@ -351,7 +351,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let shape = TaskShape { observation: 2, action: 1, unnormalized: vec![] };
         let config = SacConfig { hidden: vec![4], ..SacConfig::default() };
-        let sac = Sac::new(&shape, &config, 0, Device::Cpu);
+        let sac = Sac::new(&shape, &config, 0, Device::Cpu, 1);
         let curriculum = Curriculum::new(CurriculumConfig::default());
         let mut newest = PathBuf::new();
         for env_steps in [5, 10, 100_000, 20] {
@@ -367,7 +367,7 @@ mod tests {
         fs::write(&newest, &bytes[..bytes.len() / 2]).unwrap();
         assert_eq!(Checkpoint::newest(folder.path()).unwrap().unwrap().progress.env_steps, 20);
         let wider = SacConfig { hidden: vec![5], ..SacConfig::default() };
-        let mut other = Sac::new(&shape, &wider, 0, Device::Cpu);
+        let mut other = Sac::new(&shape, &wider, 0, Device::Cpu, 1);
         let error = Checkpoint::newest(folder.path()).unwrap().unwrap().restore(&mut other).unwrap_err();
         assert!(matches!(error, CheckpointError::Shape { .. }), "{error}");
     }

@@ -28,8 +28,18 @@ fn check(
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SacConfig {
-    /// Widths of the hidden layers of the actor and of every critic.
+    /// What the networks are made of.
+    pub network: NetworkKind,
+    /// `mlp`: widths of the hidden layers of the actor and of every critic.
     pub hidden: Vec<usize>,
+    /// `simba`: width of the actor's residual stream.
+    pub actor_width: usize,
+    /// `simba`: the actor's residual blocks.
+    pub actor_blocks: usize,
+    /// `simba`: width of every critic's residual stream.
+    pub critic_width: usize,
+    /// `simba`: every critic's residual blocks.
+    pub critic_blocks: usize,
     /// Number of critics; the target is the minimum over them.
     pub critics: usize,
     /// Transitions of a minibatch.
@@ -44,10 +54,14 @@ pub struct SacConfig {
     pub actor_lr: f64,
     /// Adam's learning rate of the critics.
     pub critic_lr: f64,
+    /// Share of every weight that decays with a step, in units of the learning rate (AdamW); 0 for Adam.
+    pub weight_decay: f64,
     /// Adam's learning rate of the temperature's logarithm.
     pub temperature_lr: f64,
     /// The temperature at the start, α.
     pub initial_temperature: f64,
+    /// The temperature never goes under it.
+    pub temperature_floor: f64,
     /// The entropy that the temperature is steered to, in nats; `auto` is −(numbers in an action).
     pub target_entropy: TargetEntropy,
     /// Updates for every env step; the rate limiter keeps it.
@@ -60,6 +74,16 @@ pub struct SacConfig {
     pub normalize_observations: bool,
     /// Env steps after which those statistics no longer change.
     pub normalize_until: u64,
+}
+
+/// See [`SacConfig::network`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NetworkKind {
+    /// Fully connected layers with a ReLU after each (App. D).
+    Mlp,
+    /// Residual blocks behind layer norms (SimBa: Lee et al. 2025).
+    Simba,
 }
 
 /// See [`SacConfig::precision`].
@@ -133,7 +157,12 @@ impl TargetEntropy {
 impl Default for SacConfig {
     fn default() -> Self {
         Self {
+            network: NetworkKind::Mlp,
             hidden: vec![1024, 1024],
+            actor_width: 128,
+            actor_blocks: 1,
+            critic_width: 128,
+            critic_blocks: 2,
             critics: 2,
             batch: 1024,
             gamma: 0.97,
@@ -141,8 +170,10 @@ impl Default for SacConfig {
             tau: 0.005,
             actor_lr: 1e-5,
             critic_lr: 1e-4,
+            weight_decay: 0.0,
             temperature_lr: 1e-4,
             initial_temperature: 0.1,
+            temperature_floor: 0.0,
             target_entropy: TargetEntropy::Auto(Auto::Auto),
             updates_per_step: 1.0,
             uniform_steps: 10_000,
@@ -158,6 +189,12 @@ impl SacConfig {
     pub fn validate(&self) -> Result<(), ConfigError> {
         let sizes = !self.hidden.is_empty() && self.hidden.iter().all(|width| (1..=16_384).contains(width));
         check(sizes, "sac.hidden", &format!("{:?}", self.hidden), "one or more widths from 1 to 16384")?;
+        for (key, width) in [("sac.actor_width", self.actor_width), ("sac.critic_width", self.critic_width)] {
+            check((1..=4096).contains(&width), key, &width, "from 1 to 4096")?;
+        }
+        for (key, blocks) in [("sac.actor_blocks", self.actor_blocks), ("sac.critic_blocks", self.critic_blocks)] {
+            check(blocks <= 64, key, &blocks, "from 0 to 64")?;
+        }
         check((1..=16).contains(&self.critics), "sac.critics", &self.critics, "from 1 to 16")?;
         check((1..=65_536).contains(&self.batch), "sac.batch", &self.batch, "from 1 to 65536")?;
         check((0.0..1.0).contains(&self.gamma), "sac.gamma", &self.gamma, "at least 0 and under 1")?;
@@ -167,11 +204,14 @@ impl SacConfig {
             ("sac.actor_lr", self.actor_lr),
             ("sac.critic_lr", self.critic_lr),
             ("sac.temperature_lr", self.temperature_lr),
+            ("sac.weight_decay", self.weight_decay),
         ] {
             check((0.0..=1.0).contains(&rate), key, &rate, "from 0 to 1")?;
         }
         let alpha = self.initial_temperature;
         check(alpha > 0.0 && alpha.is_finite(), "sac.initial_temperature", &alpha, "over 0")?;
+        let floor = self.temperature_floor;
+        check((0.0..=alpha).contains(&floor), "sac.temperature_floor", &floor, "from 0 to sac.initial_temperature")?;
         let entropy = self.target_entropy.nats(1);
         check(entropy.is_finite(), "sac.target_entropy", &entropy, "a number of nats, or \"auto\"")?;
         let rate = self.updates_per_step;
@@ -180,7 +220,19 @@ impl SacConfig {
 
     /// The actor's shape for a task.
     pub fn policy_shape(&self, observation: usize, action: usize) -> PolicyShape {
-        PolicyShape { observation, action, body: Body::Mlp { hidden: self.hidden.clone() } }
+        PolicyShape { observation, action, body: self.body(self.actor_width, self.actor_blocks) }
+    }
+
+    /// The body of every critic.
+    pub fn critic_body(&self) -> Body {
+        self.body(self.critic_width, self.critic_blocks)
+    }
+
+    fn body(&self, width: usize, blocks: usize) -> Body {
+        match self.network {
+            NetworkKind::Mlp => Body::Mlp { hidden: self.hidden.clone() },
+            NetworkKind::Simba => Body::Simba { width, blocks },
+        }
     }
 }
 

@@ -1,8 +1,10 @@
 //! The actor and the critics on libtorch, built from the same shapes as `getup-policy`'s forward pass.
 
-use getup_policy::{LOG_STD_MAX, LOG_STD_MIN, Policy, PolicyShape, init};
+use getup_policy::{Body, LOG_STD_MAX, LOG_STD_MIN, Policy, PolicyShape, init};
 use rand::Rng;
 use tch::{Device, Kind, Tensor};
+
+use getup_policy::NORM_EPSILON;
 
 use crate::parameters::Parameters;
 
@@ -42,7 +44,7 @@ impl Actor {
     pub(crate) fn forward(&self, observation: &Tensor) -> Gaussian {
         let leaves: Vec<&Tensor> = self.parameters.leaves().collect();
         let (body, heads) = leaves.split_at(leaves.len() - 4);
-        let hidden = relu_layers(observation, body, self.products);
+        let hidden = forward(&self.shape.body, observation, body, self.products);
         let log_std = hidden.linear(heads[2], Some(heads[3])).tanh();
         let half = f64::from(LOG_STD_MAX - LOG_STD_MIN) / 2.0;
         Gaussian {
@@ -79,39 +81,39 @@ impl Gaussian {
 /// Q functions over (observation, action), each a network of its own.
 pub(crate) struct Critics {
     count: usize,
+    pub(crate) body: Body,
     pub(crate) parameters: Parameters,
     /// Precision of the body's matrix products; the head's are float32, for Q must tell rewards apart.
     products: Kind,
 }
 
 impl Critics {
-    /// Orthogonal weights with gain 1, zero biases (App. D).
+    /// Critics drawn by [`init::body`], with orthogonal heads of gain 1 and zero biases (App. D).
     pub(crate) fn new(
         count: usize,
-        policy: &PolicyShape,
+        body: Body,
+        inputs: usize,
         rng: &mut impl Rng,
         products: Kind,
         device: Device,
     ) -> Self {
-        let body = &policy.body;
-        let inputs = policy.observation + policy.action;
+        let width = body.output_width(inputs);
         let mut values = Vec::new();
         for critic in 0..count {
-            let mut add = |name: String, from: usize, to: usize| {
-                let weight = init::orthogonal(to, from, 1.0, rng);
-                values.push((format!("{critic}.{name}.weight"), vec![to, from], weight));
-                values.push((format!("{critic}.{name}.bias"), vec![to], vec![0.0; to]));
+            let named = |(name, shape, data): (String, Vec<usize>, Vec<f32>)| {
+                (format!("{critic}.{name}"), shape, data)
             };
-            for layer in body.layers(inputs) {
-                add(layer.name, layer.inputs, layer.outputs);
-            }
-            add("head.value".into(), body.output_width(inputs), 1);
+            values.extend(init::body(&body, inputs, rng).into_iter().map(named));
+            let head = init::orthogonal(1, width, 1.0, rng);
+            values.push((format!("{critic}.head.value.weight"), vec![1, width], head));
+            values.push((format!("{critic}.head.value.bias"), vec![1], vec![0.0]));
         }
-        Self { count, parameters: Parameters::new(values, device), products }
+        Self { count, body, parameters: Parameters::new(values, device), products }
     }
 
     pub(crate) fn duplicate(&self) -> Self {
-        Self { count: self.count, parameters: self.parameters.duplicate(), products: self.products }
+        let Self { count, body, parameters, products } = self;
+        Self { count: *count, body: body.clone(), parameters: parameters.duplicate(), products: *products }
     }
 
     /// Q of every critic, `[critics, B]`.
@@ -122,7 +124,8 @@ impl Critics {
             .chunks(leaves.len() / self.count)
             .map(|critic| {
                 let (body, head) = critic.split_at(critic.len() - 2);
-                relu_layers(&input, body, self.products).linear(head[0], Some(head[1])).squeeze_dim(1)
+                let features = forward(&self.body, &input, body, self.products);
+                features.linear(head[0], Some(head[1])).squeeze_dim(1)
             })
             .collect();
         Tensor::stack(&values, 0)
@@ -134,12 +137,31 @@ impl Critics {
     }
 }
 
-/// Pairs of weight and bias, each followed by a ReLU, with matrix products of `products` and a float32 result.
-fn relu_layers(input: &Tensor, layers: &[&Tensor], products: Kind) -> Tensor {
-    let layer = |x: Tensor, pair: &[&Tensor]| {
-        x.linear(&pair[0].to_kind(products), Some(pair[1].to_kind(products))).relu()
+/// A body over the parameters that [`Body::tensors`] names, with matrix products of `products` and a float32 result.
+fn forward(body: &Body, input: &Tensor, parameters: &[&Tensor], products: Kind) -> Tensor {
+    let mut pairs = parameters.chunks_exact(2);
+    let mut next = || pairs.next().expect("a pair of tensors for every layer of the body");
+    let linear = |x: &Tensor, pair: &[&Tensor]| {
+        x.to_kind(products).linear(&pair[0].to_kind(products), Some(pair[1].to_kind(products)))
     };
-    layers.chunks(2).fold(input.to_kind(products), layer).to_kind(Kind::Float)
+    let norm = |x: &Tensor, pair: &[&Tensor]| {
+        x.layer_norm(pair[0].size(), Some(pair[0]), Some(pair[1]), f64::from(NORM_EPSILON), false)
+    };
+    match body {
+        Body::Mlp { hidden } => {
+            let layer = |x: Tensor, _: &usize| linear(&x, next()).relu();
+            hidden.iter().fold(input.shallow_clone(), layer).to_kind(Kind::Float)
+        }
+        Body::Simba { blocks, .. } => {
+            let mut x = linear(input, next()).to_kind(Kind::Float);
+            for _ in 0..*blocks {
+                let hidden = norm(&x, next());
+                let inner = linear(&hidden, next()).relu();
+                x += linear(&inner, next()).to_kind(Kind::Float);
+            }
+            norm(&x, next())
+        }
+    }
 }
 
 #[cfg(test)]

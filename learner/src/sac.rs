@@ -10,8 +10,9 @@ use tch::{Device, Kind, Tensor};
 
 use crate::adam::{Adam, ScalarAdam, polyak};
 use crate::config::SacConfig;
+use crate::cpu::{CpuUpdate, Flat, Inputs, Values};
 use crate::networks::{Actor, Critics};
-use crate::parameters::to_vec;
+use crate::parameters::{as_slice_mut, to_vec};
 use crate::statistics::RunningStatistics;
 
 /// What SAC must know of the task.
@@ -25,21 +26,28 @@ pub struct TaskShape {
     pub unnormalized: Vec<usize>,
 }
 
-/// `B` transitions, float32 on the host.
-#[derive(Debug)]
+/// `B` transitions, row after row, on the host.
+#[derive(Clone, Debug, Default)]
 pub struct Batch {
     /// `[B, observation]`.
-    pub observation: Tensor,
+    pub observation: Vec<f32>,
     /// `[B, action]`, in `[-β̂, β̂]`.
-    pub action: Tensor,
+    pub action: Vec<f32>,
     /// `[B]`: Σ γ^k r over the n steps.
-    pub reward: Tensor,
+    pub reward: Vec<f32>,
     /// `[B, observation]`: the state after the n steps.
-    pub next_observation: Tensor,
+    pub next_observation: Vec<f32>,
     /// `[B]`: γ^n, and 0 where a terminal state was reached.
-    pub discount: Tensor,
-    /// `[B, 1]`: the episode's β̂.
-    pub beta: Tensor,
+    pub discount: Vec<f32>,
+    /// `[B]`: the episode's β̂.
+    pub beta: Vec<f32>,
+}
+
+impl Batch {
+    /// B.
+    pub fn rows(&self) -> usize {
+        self.reward.len()
+    }
 }
 
 /// What one update found, for metrics.
@@ -77,6 +85,7 @@ pub struct Sac {
     pub(crate) config: SacConfig,
     target_entropy: f64,
     device: Device,
+    threads: usize,
     pub(crate) actor: Actor,
     pub(crate) actor_adam: Adam,
     pub(crate) critics: Critics,
@@ -87,21 +96,26 @@ pub struct Sac {
     pub(crate) statistics: RunningStatistics,
     pub(crate) rng: ChaCha8Rng,
     pub(crate) updates: u64,
+    /// The update for processors, laid out at the first one; see [`Sac::changed`].
+    cpu: Option<CpuUpdate>,
 }
 
 impl Sac {
-    /// Untrained networks, drawn from `seed`.
-    pub fn new(shape: &TaskShape, config: &SacConfig, seed: u64, device: Device) -> Self {
+    /// Untrained networks, drawn from `seed`, updated by `threads` threads on a processor.
+    pub fn new(shape: &TaskShape, config: &SacConfig, seed: u64, device: Device, threads: usize) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let products = config.precision.kind(device);
         let policy = Policy::init(config.policy_shape(shape.observation, shape.action), &mut rng);
-        let critics = Critics::new(config.critics, &policy.shape, &mut rng, products, device);
+        let inputs = shape.observation + shape.action;
+        let critics =
+            Critics::new(config.critics, config.critic_body(), inputs, &mut rng, products, device);
         let actor = Actor::new(&policy, products, device);
         Self {
             target_entropy: config.target_entropy.nats(shape.action),
             device,
-            actor_adam: Adam::new(&actor.parameters, config.actor_lr),
-            critics_adam: Adam::new(&critics.parameters, config.critic_lr),
+            threads,
+            actor_adam: Adam::new(&actor.parameters, config.actor_lr, config.weight_decay),
+            critics_adam: Adam::new(&critics.parameters, config.critic_lr, config.weight_decay),
             targets: critics.duplicate(),
             log_temperature: config.initial_temperature.ln(),
             temperature_adam: ScalarAdam::new(config.temperature_lr),
@@ -111,7 +125,13 @@ impl Sac {
             critics,
             rng,
             updates: 0,
+            cpu: None,
         }
+    }
+
+    /// The parameters were changed from outside: whatever was derived from them is made again.
+    pub(crate) fn changed(&mut self) {
+        self.cpu = None;
     }
 
     /// Updates made so far.
@@ -122,15 +142,15 @@ impl Sac {
     /// Merges a batch's observations into the statistics that normalise them, where the run normalises.
     pub fn merge_statistics(&mut self, batch: &Batch) {
         if self.config.normalize_observations {
-            self.statistics.merge(&to_vec(&batch.observation));
+            self.statistics.merge(&batch.observation);
         }
     }
 
     /// One update of critics, actor, temperature and targets.
     pub fn update(&mut self, batch: &Batch) -> Result<Losses, NonFiniteLoss> {
-        let size = batch.action.size();
-        let next_noise = self.noise(&size);
-        let noise = self.noise(&size);
+        let count = batch.action.len();
+        let mut noise = || (0..count).map(|_| self.rng.sample(StandardNormal)).collect::<Vec<f32>>();
+        let (next_noise, noise) = (noise(), noise());
         self.update_with_noise(batch, &next_noise, &noise)
     }
 
@@ -138,19 +158,42 @@ impl Sac {
     pub(crate) fn update_with_noise(
         &mut self,
         batch: &Batch,
-        next_noise: &Tensor,
-        noise: &Tensor,
+        next_noise: &[f32],
+        noise: &[f32],
     ) -> Result<Losses, NonFiniteLoss> {
-        let to = |tensor: &Tensor| tensor.to_device(self.device);
-        let (action, beta) = (to(&batch.action), to(&batch.beta));
-        let (reward, discount) = (to(&batch.reward), to(&batch.discount));
-        let observation = self.normalize(&to(&batch.observation));
-        let next_observation = self.normalize(&to(&batch.next_observation));
+        if self.cpu.is_none() && self.device == Device::Cpu {
+            self.cpu = self.lay_out();
+        }
+        match self.cpu.take() {
+            Some(mut cpu) => {
+                let losses = self.update_on_cpu(&mut cpu, batch, next_noise, noise);
+                self.cpu = Some(cpu);
+                losses
+            }
+            None => self.update_by_autograd(batch, next_noise, noise),
+        }
+    }
+
+    /// The update as the paper's equations: for every device, and what the faster one is tested against.
+    pub(crate) fn update_by_autograd(
+        &mut self,
+        batch: &Batch,
+        next_noise: &[f32],
+        noise: &[f32],
+    ) -> Result<Losses, NonFiniteLoss> {
+        let rows = batch.rows() as i64;
+        let matrix = |values: &[f32]| Tensor::from_slice(values).view([rows, -1]).to_device(self.device);
+        let column = |values: &[f32]| Tensor::from_slice(values).to_device(self.device);
+        let (action, beta) = (matrix(&batch.action), matrix(&batch.beta));
+        let (reward, discount) = (column(&batch.reward), column(&batch.discount));
+        let (next_noise, noise) = (matrix(next_noise), matrix(noise));
+        let observation = self.normalize(&matrix(&batch.observation));
+        let next_observation = self.normalize(&matrix(&batch.next_observation));
         let temperature = self.log_temperature.exp();
 
         // y = r + γ (min Q'(s', a') − α log π(a'|s')), a' ~ π(s')
         let target = tch::no_grad(|| {
-            let next = self.actor.forward(&next_observation).sample(&beta, next_noise);
+            let next = self.actor.forward(&next_observation).sample(&beta, &next_noise);
             let next_q = self.targets.minimum(&next_observation, &next.action);
             reward + discount * (next_q - next.log_prob * temperature)
         });
@@ -158,27 +201,71 @@ impl Sac {
         // Σ over critics of mean (Q − y)²
         let q = self.critics.forward(&observation, &action);
         let critic_loss = (&q - target).square().mean_dim(&[1i64][..], false, Kind::Float).sum(Kind::Float);
-        let critic = self.finite("critic", &critic_loss)?;
-        let mut gradient = self.critics.parameters.gradient(&critic_loss);
-        self.critics_adam.step(&mut self.critics.parameters, &mut gradient);
+        let critic = self.finite("critic", critic_loss.double_value(&[]))?;
+        let gradient = self.critics.parameters.gradient(&critic_loss);
+        self.critics_adam.step(&mut self.critics.parameters, &gradient);
 
         // mean (α log π(a|s) − min Q(s, a)), a ~ π(s)
-        let sample = self.actor.forward(&observation).sample(&beta, noise);
+        let sample = self.actor.forward(&observation).sample(&beta, &noise);
         let value = self.critics.minimum(&observation, &sample.action);
         let actor_loss = (&sample.log_prob * temperature - value).mean(Kind::Float);
-        let actor = self.finite("actor", &actor_loss)?;
-        let mut gradient = self.actor.parameters.gradient(&actor_loss);
-        self.actor_adam.step(&mut self.actor.parameters, &mut gradient);
+        let actor = self.finite("actor", actor_loss.double_value(&[]))?;
+        let gradient = self.actor.parameters.gradient(&actor_loss);
+        self.actor_adam.step(&mut self.actor.parameters, &gradient);
 
-        // mean α (−log π − H̄), by log α
         let entropy = -sample.log_prob.mean(Kind::Float).double_value(&[]);
-        let gradient = temperature * (entropy - self.target_entropy);
-        self.log_temperature = self.temperature_adam.step(self.log_temperature, gradient);
-
         polyak(&mut self.targets.parameters, &self.critics.parameters, self.config.tau);
-        self.updates += 1;
         let q = q.mean(Kind::Float).double_value(&[]);
-        Ok(Losses { critic, actor, temperature: self.log_temperature.exp(), entropy, q })
+        Ok(self.end_update(critic, actor, entropy, q))
+    }
+
+    /// The same, written out: see [`crate::cpu`].
+    fn update_on_cpu(
+        &mut self,
+        cpu: &mut CpuUpdate,
+        batch: &Batch,
+        next_noise: &[f32],
+        noise: &[f32],
+    ) -> Result<Losses, NonFiniteLoss> {
+        let statistics = self.config.normalize_observations.then(|| self.statistics.snapshot());
+        let [mut actor, mut critics, mut targets] =
+            [&self.actor.parameters, &self.critics.parameters, &self.targets.parameters]
+                .map(|parameters| parameters.flat().shallow_clone());
+        let (actor, critics) = (as_slice_mut(&mut actor), as_slice_mut(&mut critics));
+        let targets = as_slice_mut(&mut targets);
+        let temperature = self.log_temperature.exp() as f32;
+        let inputs = Inputs { batch, statistics: statistics.as_ref(), next_noise, noise, temperature };
+
+        let critic = cpu.critics_backward(&inputs, Values { actor, critics, targets });
+        let critic_loss = self.finite("critic", critic.loss)?;
+        let step = self.critics_adam.begin_step();
+        let (first, second) = self.critics_adam.moments();
+        cpu.critics_step(Flat { values: critics, first, second }, targets, step, self.config.tau as f32);
+
+        let policy = cpu.actor_backward(&inputs, Values { actor, critics, targets });
+        let actor_loss = self.finite("actor", policy.loss)?;
+        let step = self.actor_adam.begin_step();
+        let (first, second) = self.actor_adam.moments();
+        cpu.actor_step(Flat { values: actor, first, second }, step);
+        Ok(self.end_update(critic_loss, actor_loss, policy.value, critic.value))
+    }
+
+    /// The temperature's step, along the gradient of mean α (−log π − H̄) by log α; and the count.
+    fn end_update(&mut self, critic: f64, actor: f64, entropy: f64, q: f64) -> Losses {
+        let gradient = self.log_temperature.exp() * (entropy - self.target_entropy);
+        let floor = self.config.temperature_floor.ln();
+        self.log_temperature = self.temperature_adam.step(self.log_temperature, gradient).max(floor);
+        self.updates += 1;
+        Losses { critic, actor, temperature: self.log_temperature.exp(), entropy, q }
+    }
+
+    fn lay_out(&self) -> Option<CpuUpdate> {
+        let [actor, critics, targets] =
+            [&self.actor.parameters, &self.critics.parameters, &self.targets.parameters]
+                .map(|parameters| to_vec(parameters.flat()));
+        let values = Values { actor: &actor, critics: &critics, targets: &targets };
+        let bf16 = self.config.precision.is_bf16();
+        CpuUpdate::new(&self.actor.shape, &self.critics.body, bf16, self.threads, values)
     }
 
     /// The actor as it is now, with the statistics that its observations are normalised by.
@@ -192,12 +279,6 @@ impl Sac {
         }
     }
 
-    fn noise(&mut self, size: &[i64]) -> Tensor {
-        let count = size.iter().product::<i64>() as usize;
-        let values: Vec<f32> = (0..count).map(|_| self.rng.sample(StandardNormal)).collect();
-        Tensor::from_slice(&values).view(size).to_device(self.device)
-    }
-
     fn normalize(&self, observation: &Tensor) -> Tensor {
         if !self.config.normalize_observations {
             return observation.shallow_clone();
@@ -208,8 +289,7 @@ impl Sac {
         ((observation - row(&statistics.mean)) / row(&statistics.std)).clamp(-clip, clip)
     }
 
-    fn finite(&self, name: &'static str, loss: &Tensor) -> Result<f64, NonFiniteLoss> {
-        let value = loss.double_value(&[]);
+    fn finite(&self, name: &'static str, value: f64) -> Result<f64, NonFiniteLoss> {
         if value.is_finite() { Ok(value) } else { Err(NonFiniteLoss { name, value, update: self.updates }) }
     }
 }

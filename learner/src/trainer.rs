@@ -11,7 +11,6 @@ use std::time::{Duration, Instant};
 use getup_proto::{PolicyVersion, v1};
 use getup_replay::{Minibatch, MinibatchSource, ReplayCounters, SampleError};
 use getup_telemetry::{Registry, Shutdown};
-use tch::Tensor;
 
 use crate::checkpoint::{Checkpoint, CheckpointError, Progress};
 use crate::config::{ConfigError, CurriculumConfig, EvaluationConfig, LearnerConfig, SacConfig};
@@ -128,7 +127,7 @@ impl Trainer {
         registry: &Registry,
     ) -> Result<Self, TrainError> {
         folder.create()?;
-        let mut sac = Sac::new(&config.shape, &config.sac, config.seed, device);
+        let mut sac = Sac::new(&config.shape, &config.sac, config.seed, device, config.learner.effective_threads());
         let mut curriculum = Curriculum::new(config.curriculum.clone());
         let mut progress = Progress { next_evaluation: config.evaluation.every, ..Progress::default() };
         let checkpoint = if resume { Checkpoint::newest(&folder.checkpoints())? } else { None };
@@ -184,7 +183,7 @@ impl Trainer {
             match source.poll(STARVED) {
                 Ok(Some(minibatch)) => {
                     self.metrics.wait_seconds.observe(asked.elapsed().as_secs_f64());
-                    self.tick(&minibatch)?;
+                    self.tick(minibatch)?;
                 }
                 Ok(None) => self.take_reports()?,
                 Err(SampleError::Shutdown) => break,
@@ -198,10 +197,10 @@ impl Trainer {
     }
 
     /// One update and everything that follows from it.
-    pub fn tick(&mut self, minibatch: &Minibatch) -> Result<(), TrainError> {
+    pub fn tick(&mut self, mut minibatch: Minibatch) -> Result<(), TrainError> {
         let started = Instant::now();
         self.progress.count(&minibatch.counters);
-        let batch = Batch::from_minibatch(minibatch)?;
+        let batch = Batch::from_minibatch(&mut minibatch)?;
         if self.progress.env_steps < self.config.sac.normalize_until {
             self.sac.merge_statistics(&batch);
         }
@@ -329,19 +328,18 @@ impl Progress {
 }
 
 impl Batch {
-    /// The tensors of a minibatch: one copy a column.
-    pub fn from_minibatch(minibatch: &Minibatch) -> Result<Self, TrainError> {
-        let column = |name: &'static str| {
-            let column = minibatch.columns.iter().find(|column| column.name == name);
-            let column = column.ok_or(TrainError::Column(name))?;
-            Ok::<_, TrainError>(Tensor::from_slice(&column.data).view([-1, column.width as i64]))
+    /// Takes the columns out of a minibatch.
+    pub fn from_minibatch(minibatch: &mut Minibatch) -> Result<Self, TrainError> {
+        let mut column = |name: &'static str| {
+            let column = minibatch.columns.iter_mut().find(|column| column.name == name);
+            column.map(|column| std::mem::take(&mut column.data)).ok_or(TrainError::Column(name))
         };
         Ok(Self {
             observation: column("observation")?,
             action: column("action")?,
-            reward: column("reward")?.squeeze_dim(1),
+            reward: column("reward")?,
             next_observation: column("next_observation")?,
-            discount: column("discount")?.squeeze_dim(1),
+            discount: column("discount")?,
             beta: column("beta")?,
         })
     }

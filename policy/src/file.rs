@@ -76,10 +76,14 @@ impl Policy {
     /// An untrained policy: orthogonal weights with gain 1, zero biases (App. D).
     pub fn init(shape: PolicyShape, rng: &mut impl Rng) -> Self {
         let mut tensors = BTreeMap::new();
-        for layer in shape.layers() {
-            let weight = orthogonal(layer.outputs, layer.inputs, 1.0, rng);
-            tensors.insert(format!("{}.weight", layer.name), weight);
-            tensors.insert(format!("{}.bias", layer.name), vec![0.0; layer.outputs]);
+        for (name, _, values) in crate::init::body(&shape.body, shape.observation, rng) {
+            tensors.insert(name, values);
+        }
+        let width = shape.body.output_width(shape.observation);
+        let gain = if matches!(shape.body, crate::Body::Mlp { .. }) { 1.0 } else { 0.01 };
+        for head in ["head.mean", "head.log_std"] {
+            tensors.insert(format!("{head}.weight"), orthogonal(shape.action, width, gain, rng));
+            tensors.insert(format!("{head}.bias"), vec![0.0; shape.action]);
         }
         Self { shape, tensors, statistics: None, metadata: BTreeMap::new() }
     }

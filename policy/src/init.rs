@@ -3,6 +3,8 @@
 use rand::Rng;
 use rand_distr::StandardNormal;
 
+use crate::Body;
+
 /// A `[rows, columns]` matrix, row-major, whose shorter side is orthonormal, times `gain`.
 ///
 /// Gram–Schmidt, applied twice, on Gaussian vectors: their span is uniform over all subspaces.
@@ -31,6 +33,23 @@ pub fn orthogonal(rows: usize, columns: usize, gain: f32, rng: &mut impl Rng) ->
         }
     }
     matrix
+}
+
+/// The body's initial tensors, in the order of [`Body::tensors`].
+pub fn body(body: &Body, inputs: usize, rng: &mut impl Rng) -> Vec<(String, Vec<usize>, Vec<f32>)> {
+    let init = |(name, shape): (String, Vec<usize>)| {
+        let values = match shape[..] {
+            [rows, columns] if name.ends_with(".up.weight") || name.ends_with(".down.weight") => {
+                let std = (2.0 / columns as f32).sqrt();
+                (0..rows * columns).map(|_| std * rng.sample::<f32, _>(StandardNormal)).collect()
+            }
+            [rows, columns] => orthogonal(rows, columns, 1.0, rng),
+            [width] if name.ends_with("norm.weight") => vec![1.0; width],
+            _ => vec![0.0; shape[0]],
+        };
+        (name, shape, values)
+    };
+    body.tensors(inputs).into_iter().map(init).collect()
 }
 
 /// Sums in eight independent parts, which vectorises.

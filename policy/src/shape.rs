@@ -18,7 +18,17 @@ pub enum Body {
         /// Widths of the hidden layers.
         hidden: Vec<usize>,
     },
+    /// Residual blocks behind layer norms (SimBa).
+    Simba {
+        /// Width of the residual stream.
+        width: usize,
+        /// Blocks.
+        blocks: usize,
+    },
 }
+
+/// LayerNorm epsilon.
+pub const NORM_EPSILON: f32 = 1e-5;
 
 /// The shape of a squashed Gaussian policy: observation → body → mean and log standard deviation.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -52,7 +62,7 @@ impl Linear {
 impl Body {
     /// The body's layers for an input of width `inputs`, in order.
     pub fn layers(&self, inputs: usize) -> Vec<Linear> {
-        let Body::Mlp { hidden } = self;
+        let Body::Mlp { hidden } = self else { unreachable!() };
         let widths = std::iter::once(&inputs).chain(hidden);
         widths
             .zip(hidden)
@@ -63,8 +73,36 @@ impl Body {
 
     /// Width of what the body gives to the heads.
     pub fn output_width(&self, inputs: usize) -> usize {
-        let Body::Mlp { hidden } = self;
-        hidden.last().copied().unwrap_or(inputs)
+        match self {
+            Body::Mlp { hidden } => hidden.last().copied().unwrap_or(inputs),
+            Body::Simba { width, .. } => *width,
+        }
+    }
+
+    /// Names and shapes of the body's tensors, in order.
+    pub fn tensors(&self, inputs: usize) -> Vec<(String, Vec<usize>)> {
+        let mut tensors = Vec::new();
+        let mut linear = |name: &str, from: usize, to: usize| {
+            tensors.push((format!("{name}.weight"), if from == 0 { vec![to] } else { vec![to, from] }));
+            tensors.push((format!("{name}.bias"), vec![to]));
+        };
+        match self {
+            Body::Mlp { .. } => {
+                for layer in self.layers(inputs) {
+                    linear(&layer.name, layer.inputs, layer.outputs);
+                }
+            }
+            Body::Simba { width, blocks } => {
+                linear("body.embed", inputs, *width);
+                for block in 0..*blocks {
+                    linear(&format!("body.{block}.norm"), 0, *width);
+                    linear(&format!("body.{block}.up"), *width, 4 * width);
+                    linear(&format!("body.{block}.down"), 4 * width, *width);
+                }
+                linear("body.norm", 0, *width);
+            }
+        }
+        tensors
     }
 }
 
@@ -79,16 +117,14 @@ impl PolicyShape {
         layers
     }
 
-    /// Names and shapes of all tensors, in the order of [`PolicyShape::layers`].
+    /// Names and shapes of all tensors, in order.
     pub fn tensors(&self) -> Vec<(String, Vec<usize>)> {
-        self.layers()
-            .into_iter()
-            .flat_map(|layer| {
-                [
-                    (format!("{}.weight", layer.name), vec![layer.outputs, layer.inputs]),
-                    (format!("{}.bias", layer.name), vec![layer.outputs]),
-                ]
-            })
-            .collect()
+        let mut tensors = self.body.tensors(self.observation);
+        let width = self.body.output_width(self.observation);
+        for head in ["head.mean", "head.log_std"] {
+            tensors.push((format!("{head}.weight"), vec![self.action, width]));
+            tensors.push((format!("{head}.bias"), vec![self.action]));
+        }
+        tensors
     }
 }

@@ -106,7 +106,7 @@ impl Turns {
     fn update(&mut self, role: &Role) -> Result<()> {
         while self.trainer.ending().is_none() && !role.shutdown.is_triggered() {
             match self.store.try_sample(&mut self.sampler, &self.options)? {
-                Some(minibatch) => self.trainer.tick(&minibatch)?,
+                Some(minibatch) => self.trainer.tick(minibatch)?,
                 None => break,
             }
         }

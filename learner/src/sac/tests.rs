@@ -42,8 +42,16 @@ fn assert_close(parameters: &Parameters, recorded: &BTreeMap<String, Vec<f32>>, 
     }
 }
 
+/// One of the two ways to take an update.
+type Update = fn(&mut Sac, &Batch, &[f32], &[f32]) -> Result<Losses, NonFiniteLoss>;
+
 #[test]
-fn updates_of_a_tiny_network_match_pytorch() {
+fn updates_of_a_tiny_network_match_pytorch_both_ways() {
+    matches_pytorch(Sac::update_by_autograd);
+    matches_pytorch(Sac::update_with_noise);
+}
+
+fn matches_pytorch(take: Update) {
     let record: Record = serde_json::from_str(include_str!("../../tests/data/sac_update.json")).unwrap();
     let config = SacConfig {
         hidden: vec![4, 4],
@@ -54,23 +62,21 @@ fn updates_of_a_tiny_network_match_pytorch() {
         ..SacConfig::default()
     };
     let shape = TaskShape { observation: 3, action: 2, unnormalized: vec![] };
-    let mut sac = Sac::new(&shape, &config, 0, Device::Cpu);
+    let mut sac = Sac::new(&shape, &config, 0, Device::Cpu, 1);
     load(&mut sac.actor.parameters, &record.actor);
     load(&mut sac.critics.parameters, &record.critics);
     load(&mut sac.targets.parameters, &record.critics);
     for update in &record.updates {
-        let column = |name: &str, size: &[i64]| Tensor::from_slice(&update.batch[name]).view(size);
+        let column = |name: &str| update.batch[name].clone();
         let batch = Batch {
-            observation: column("observation", &[5, 3]),
-            action: column("action", &[5, 2]),
-            reward: column("reward", &[5]),
-            next_observation: column("next_observation", &[5, 3]),
-            discount: column("discount", &[5]),
-            beta: column("beta", &[5, 1]),
+            observation: column("observation"),
+            action: column("action"),
+            reward: column("reward"),
+            next_observation: column("next_observation"),
+            discount: column("discount"),
+            beta: column("beta"),
         };
-        let noise = |values: &[f32]| Tensor::from_slice(values).view([5, 2]);
-        let losses =
-            sac.update_with_noise(&batch, &noise(&update.next_noise), &noise(&update.noise)).unwrap();
+        let losses = take(&mut sac, &batch, &update.next_noise, &update.noise).unwrap();
         assert!((losses.critic - update.critic_loss).abs() < 1e-5);
         assert!((losses.actor - update.actor_loss).abs() < 1e-5);
         assert!((losses.entropy - update.entropy).abs() < 1e-4);
@@ -88,14 +94,13 @@ fn toy_batch(size: usize, gamma: f32, rng: &mut ChaCha8Rng) -> Batch {
     let observation: Vec<f32> = (0..size).map(|_| uniform(rng)).collect();
     let action: Vec<f32> = (0..size).map(|_| uniform(rng)).collect();
     let reward: Vec<f32> = action.iter().map(|action| 1.0 - (action - 0.5).powi(2)).collect();
-    let rows = size as i64;
     Batch {
-        observation: Tensor::from_slice(&observation).view([rows, 1]),
-        next_observation: Tensor::from_slice(&action).view([rows, 1]),
-        action: Tensor::from_slice(&action).view([rows, 1]),
-        reward: Tensor::from_slice(&reward),
-        discount: Tensor::full([rows], f64::from(gamma), (Kind::Float, Device::Cpu)),
-        beta: Tensor::ones([rows, 1], (Kind::Float, Device::Cpu)),
+        observation,
+        next_observation: action.clone(),
+        action,
+        reward,
+        discount: vec![gamma; size],
+        beta: vec![1.0; size],
     }
 }
 
@@ -121,7 +126,7 @@ fn a_toy_task_is_learned_to_its_known_optimum_normalised_or_not_and_in_both_prec
     {
         let config = SacConfig { normalize_observations, precision, ..toy_config() };
         let shape = TaskShape { observation: 1, action: 1, unnormalized: vec![] };
-        let mut sac = Sac::new(&shape, &config, 3, Device::Cpu);
+        let mut sac = Sac::new(&shape, &config, 3, Device::Cpu, 1);
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         let mut losses = Losses::default();
         for _ in 0..1500 {
@@ -146,7 +151,7 @@ fn the_actors_forward_pass_agrees_with_the_learners_network_on_every_shape() {
     {
         let config = SacConfig { hidden, normalize_observations: true, ..SacConfig::default() };
         let shape = TaskShape { observation, action, unnormalized: vec![observation - 1] };
-        let mut sac = Sac::new(&shape, &config, 5, Device::Cpu);
+        let mut sac = Sac::new(&shape, &config, 5, Device::Cpu, 1);
         let mut rng = ChaCha8Rng::seed_from_u64(6);
         let values: Vec<f32> = (0..33 * observation).map(|_| rng.random_range(-3.0..3.0)).collect();
         sac.statistics.merge(&values);
@@ -169,7 +174,7 @@ fn in_bfloat16_the_learners_network_stays_within_its_rounding_of_the_actors() {
     let shape = TaskShape { observation: 68, action: 21, unnormalized: vec![] };
     let network = |precision| {
         let config = SacConfig { hidden: vec![256, 256], precision, ..SacConfig::default() };
-        Sac::new(&shape, &config, 5, Device::Cpu)
+        Sac::new(&shape, &config, 5, Device::Cpu, 1)
     };
     let (exact, rounded) = (network(Precision::Fp32), network(Precision::Bf16));
     let mut rng = ChaCha8Rng::seed_from_u64(6);
@@ -185,9 +190,9 @@ fn in_bfloat16_the_learners_network_stays_within_its_rounding_of_the_actors() {
 #[test]
 fn a_loss_that_is_not_a_number_stops_the_update_and_says_which() {
     let shape = TaskShape { observation: 1, action: 1, unnormalized: vec![] };
-    let mut sac = Sac::new(&shape, &toy_config(), 0, Device::Cpu);
+    let mut sac = Sac::new(&shape, &toy_config(), 0, Device::Cpu, 1);
     let mut batch = toy_batch(64, 0.8, &mut ChaCha8Rng::seed_from_u64(0));
-    batch.reward *= f64::INFINITY;
+    batch.reward.fill(f32::INFINITY);
     let before = to_vec(sac.critics.parameters.flat());
     let error = sac.update(&batch).unwrap_err();
     assert_eq!((error.name, error.update), ("critic", 0));

@@ -1,0 +1,21 @@
+//! The update of SAC written out for processors: the same mathematics as [`crate::sac`]'s, without autograd.
+//!
+//! A minibatch is divided over the threads by transitions. Each goes forward and back through its own
+//! ([`network`]) on products in bfloat16 or float32 ([`product`]) and vectorised passes between them ([`kernels`],
+//! [`math`]); the threads' gradients are added in a fixed order, and one pass over the flat buffers does AdamW,
+//! Polyak and the layout of the new weights ([`update`]). The heads, the losses and all that is kept stay float32.
+//!
+//! Given the same number of threads, the same minibatches give the same bits.
+
+mod kernels;
+mod math;
+mod network;
+mod product;
+mod update;
+
+
+#[cfg(test)]
+mod tests;
+
+pub(crate) use kernels::AdamStep;
+pub(crate) use update::{CpuUpdate, Flat, Inputs, Values};
