@@ -19,6 +19,13 @@ pub struct ActorConfig {
     pub queue_segments: usize,
     /// Whether the limp steps of falls are stored too (Table 1). They never count as env steps.
     pub store_limp: bool,
+    /// Fallen states that are kept to begin episodes from, instead of playing a fall for each; 0 for none.
+    pub fall_pool: usize,
+    /// Share of the draws from the pool that play a fall after all, and renew a state of it.
+    pub fall_renewal: f64,
+    /// The noise of the actions is held for a number of steps k drawn with probability ∝ 1/k² up to this many
+    /// (FlashSAC); 1 draws it anew in every step.
+    pub noise_hold: usize,
     /// How long a shutdown may take to send what is queued, in seconds.
     pub drain_seconds: f64,
 }
@@ -32,6 +39,9 @@ impl Default for ActorConfig {
             segment_steps: 64,
             queue_segments: 16,
             store_limp: true,
+            fall_pool: 0,
+            fall_renewal: 0.1,
+            noise_hold: 1,
             drain_seconds: 5.0,
         }
     }
@@ -54,6 +64,9 @@ pub enum ConfigError {
         /// Lanes to divide over them.
         lanes: usize,
     },
+    /// Not a share, or a pool that would never change.
+    #[error("actor.fall_renewal is {0}: it must be over 0 and at most 1")]
+    Renewal(f64),
     /// Not a duration.
     #[error(
         "actor.drain_seconds is {0}: it must be between 0 and 8, for a shutdown takes ten seconds at most"
@@ -75,12 +88,16 @@ impl ActorConfig {
             ("threads", self.threads),
             ("segment_steps", self.segment_steps),
             ("queue_segments", self.queue_segments),
+            ("noise_hold", self.noise_hold),
         ];
         if let Some((name, _)) = counts.into_iter().find(|(_, count)| *count == 0) {
             return Err(ConfigError::Zero(name));
         }
         if self.threads > self.lanes {
             return Err(ConfigError::Threads { threads: self.threads, lanes: self.lanes });
+        }
+        if !(self.fall_renewal > 0.0 && self.fall_renewal <= 1.0) {
+            return Err(ConfigError::Renewal(self.fall_renewal));
         }
         if !(0.0..=8.0).contains(&self.drain_seconds) {
             return Err(ConfigError::Drain(self.drain_seconds));

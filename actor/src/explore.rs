@@ -23,10 +23,57 @@ impl BetaDraw {
     }
 }
 
-/// Samples a = β̂·tanh(u), u ~ N(`mean`, exp(`log_std`)), one number a motor.
-pub fn sample_action(mean: &[f32], log_std: &[f32], beta: f32, rng: &mut impl Rng, action: &mut [f32]) {
-    for ((component, mean), log_std) in action.iter_mut().zip(mean).zip(log_std) {
-        let noise: f32 = rng.sample(StandardNormal);
+/// The standard normal noise of a lane's actions, held for some steps: a body moved by the same push for a while gets
+/// further than one that trembles.
+#[derive(Clone, Debug)]
+pub struct Noise {
+    values: Vec<f32>,
+    /// Steps that it is still held for.
+    left: usize,
+    /// Probability that it is held for at most 1, 2, … steps.
+    cumulative: Vec<f64>,
+}
+
+impl Noise {
+    /// Noise for `width` motors, held for k ≤ `longest` steps with probability ∝ 1/k².
+    pub fn new(width: usize, longest: usize) -> Self {
+        let mut cumulative: Vec<f64> = (1..=longest.max(1))
+            .scan(0.0, |sum, k| {
+                *sum += (k as f64).powi(-2);
+                Some(*sum)
+            })
+            .collect();
+        let total = cumulative[cumulative.len() - 1];
+        cumulative.iter_mut().for_each(|sum| *sum /= total);
+        Self { values: vec![0.0; width], left: 0, cumulative }
+    }
+
+    /// Draws anew at the next step: an episode begins.
+    pub fn release(&mut self) {
+        self.left = 0;
+    }
+
+    /// The noise of the next step, one number a motor.
+    pub fn next(&mut self, rng: &mut impl Rng) -> &[f32] {
+        if self.left == 0 {
+            self.values.iter_mut().for_each(|value| *value = rng.sample(StandardNormal));
+            // Without a choice nothing is drawn.
+            self.left = match self.cumulative.len() {
+                1 => 1,
+                longest => {
+                    let uniform: f64 = rng.random();
+                    1 + self.cumulative.partition_point(|sum| *sum <= uniform).min(longest - 1)
+                }
+            };
+        }
+        self.left -= 1;
+        &self.values
+    }
+}
+
+/// a = β̂·tanh(u), u = mean + exp(log_std)·noise, one number a motor.
+pub fn sample_action(mean: &[f32], log_std: &[f32], noise: &[f32], beta: f32, action: &mut [f32]) {
+    for (((component, mean), log_std), noise) in action.iter_mut().zip(mean).zip(log_std).zip(noise) {
         *component = squash(mean + log_std.exp() * noise, beta);
     }
 }

@@ -11,16 +11,17 @@ use std::time::Instant;
 use getup_policy::{Forward, PolicyShape};
 use getup_proto::{PolicyVersion, RunSpec, Segment};
 use getup_sim::{Diverged, Lane, Phase, Step, Task};
-use rand::RngCore;
+use rand::{Rng, RngCore};
 use rand_chacha::ChaCha8Rng;
 use thiserror::Error;
 
 use crate::config::ActorConfig;
 use crate::divergence::DivergenceLog;
-use crate::explore::{BetaDraw, sample_action, uniform_action};
+use crate::explore::{BetaDraw, Noise, sample_action, uniform_action};
 use crate::identity::Identity;
 use crate::link::PolicyUpdate;
 use crate::metrics::ActorMetrics;
+use crate::pool::FallPool;
 use crate::segments::{LayoutError, SegmentBuilder, StepEnd, StepRecord};
 
 /// A policy of another shape than the task.
@@ -65,6 +66,7 @@ pub struct LaneGroup {
     /// `[lanes in control, observation]`.
     batch: Vec<f32>,
     divergences: DivergenceLog,
+    pool: FallPool,
 }
 
 impl LaneGroup {
@@ -80,12 +82,15 @@ impl LaneGroup {
     ) -> Result<Self, GroupError> {
         check_shape(&*settings.task, &update)?;
         let last_lane = first_lane + lanes as u32;
-        let players = (first_lane..last_lane).map(|lane| Player::new(&settings, lane, &update));
-        let players = players.collect::<Result<Vec<_>, _>>()?;
+        let players = (first_lane..last_lane).map(|lane| Player::new(&settings, lane));
+        let mut players = players.collect::<Result<Vec<_>, _>>()?;
+        let mut pool = FallPool::new(settings.config.fall_pool, settings.config.fall_renewal);
+        players.iter_mut().for_each(|player| player.begin(0, &settings, &update, &mut pool));
         Ok(Self {
             forward: Forward::new(&update.policy, lanes),
             batch: Vec::with_capacity(lanes * settings.task.observation_width()),
             divergences: DivergenceLog::new(settings.diverged_folder.clone()),
+            pool,
             players,
             update,
             settings,
@@ -129,7 +134,7 @@ impl LaneGroup {
             }
             let row = if player.acts() { rows.next() } else { None };
             player.choose(row);
-            match player.play(&self.update, &self.settings.metrics) {
+            match player.play(&self.update, &self.settings.metrics, &mut self.pool) {
                 Ok(segment) => out.extend(segment),
                 Err(diverged) => {
                     self.settings.metrics.diverged_episodes.inc();
@@ -138,7 +143,7 @@ impl LaneGroup {
                 }
             }
             if player.over {
-                player.begin(player.episode + 1, &self.settings, &self.update);
+                player.begin(player.episode + 1, &self.settings, &self.update, &mut self.pool);
             }
         }
         let metrics = &self.settings.metrics;
@@ -175,6 +180,8 @@ struct Player {
     delay: usize,
     episode: u64,
     over: bool,
+    /// Whether the episode began with a fall, whose landing the pool takes.
+    falls: bool,
     beta: f32,
     rng: ChaCha8Rng,
     builder: SegmentBuilder,
@@ -182,19 +189,21 @@ struct Player {
     observation: Vec<f32>,
     next_observation: Vec<f32>,
     action: Vec<f32>,
+    noise: Noise,
 }
 
 impl Player {
-    fn new(settings: &LaneSettings, index: u32, update: &PolicyUpdate) -> Result<Self, LayoutError> {
+    fn new(settings: &LaneSettings, index: u32) -> Result<Self, LayoutError> {
         let LaneSettings { task, config, spec, identity, .. } = settings;
         let (observation, action) = (task.observation_width(), task.action_width());
         let episode_steps = task.episode_steps() + task.resets().longest();
-        let mut player = Self {
+        Ok(Self {
             lane: Lane::new(task.clone()),
             index,
             delay: index as usize * episode_steps / config.lanes,
             episode: 0,
             over: false,
+            falls: false,
             beta: 0.0,
             rng: identity.episode_rng(index, 0),
             builder: SegmentBuilder::new(
@@ -209,18 +218,28 @@ impl Player {
             observation: vec![0.0; observation],
             next_observation: vec![0.0; observation],
             action: vec![0.0; action],
-        };
-        player.begin(0, settings, update);
-        Ok(player)
+            noise: Noise::new(action, config.noise_hold),
+        })
     }
 
-    fn begin(&mut self, episode: u64, settings: &LaneSettings, update: &PolicyUpdate) {
+    fn begin(&mut self, episode: u64, settings: &LaneSettings, update: &PolicyUpdate, pool: &mut FallPool) {
         self.episode = episode;
         self.over = false;
         self.rng = settings.identity.episode_rng(self.index, episode);
         let seed = self.rng.next_u64();
         self.beta = settings.beta.draw(update.beta, &mut self.rng);
-        self.lane.begin(seed, self.beta.into());
+        self.noise.release();
+        // Nothing is drawn where nothing is chosen: a run without these settings keeps its episodes.
+        let high = update.high_starts > 0.0 && self.rng.random_bool(update.high_starts);
+        if high {
+            self.lane.begin_standing(seed, self.beta.into());
+        } else if let Some((qpos, qvel)) = pool.draw(&mut self.rng) {
+            let begun = self.lane.begin_at(qpos, qvel, self.beta.into());
+            begun.expect("a landed state is one of this character's");
+        } else {
+            self.lane.begin(seed, self.beta.into());
+        }
+        self.falls = !high && self.lane.phase() == Phase::Limp;
         self.lane.observe(&mut self.observation);
         self.builder.begin(episode, update.stage, self.beta);
     }
@@ -235,16 +254,26 @@ impl Player {
         match (self.lane.phase(), row) {
             (Phase::Limp, _) => self.lane.limp_action(&mut self.action),
             (Phase::Control, Some((mean, log_std))) => {
-                sample_action(mean, log_std, self.beta, &mut self.rng, &mut self.action);
+                let noise = self.noise.next(&mut self.rng);
+                sample_action(mean, log_std, noise, self.beta, &mut self.action);
             }
             (Phase::Control, None) => uniform_action(self.beta, &mut self.rng, &mut self.action),
         }
     }
 
     /// Plays the chosen action.
-    fn play(&mut self, update: &PolicyUpdate, metrics: &ActorMetrics) -> Result<Option<Segment>, Diverged> {
+    fn play(
+        &mut self,
+        update: &PolicyUpdate,
+        metrics: &ActorMetrics,
+        pool: &mut FallPool,
+    ) -> Result<Option<Segment>, Diverged> {
         let env_step = self.lane.phase() == Phase::Control;
         let step = self.lane.step(&self.action)?;
+        if step.landed && self.falls {
+            let (qpos, qvel) = self.lane.phase_start();
+            pool.put(qpos, qvel, &mut self.rng);
+        }
         self.lane.observe(&mut self.next_observation);
         let segment = if env_step || self.store_limp {
             self.builder.push(&StepRecord {

@@ -24,6 +24,7 @@ pub mod lanes;
 pub mod link;
 pub mod metrics;
 mod office;
+mod pool;
 mod queue;
 pub mod segments;
 pub mod worker;

@@ -17,6 +17,8 @@ use tokio::sync::watch;
 pub const POLICY_NETWORK: &str = "policy";
 /// The named value that holds the curriculum's β^i.
 pub const BETA_VALUE: &str = "beta";
+/// The named value that holds the share of episodes that begin high; none where it is absent.
+pub const HIGH_STARTS_VALUE: &str = "high_starts";
 /// The evaluation scenario of the get-up task: falls that their seeds alone determine.
 pub const FALLS_SCENARIO: &str = "falls";
 
@@ -29,6 +31,8 @@ pub struct PolicyUpdate {
     pub policy: Arc<Policy>,
     /// The curriculum's torque limit β^i, over 0.
     pub beta: f64,
+    /// The share of training's episodes that begin high, in [0, 1].
+    pub high_starts: f64,
     /// All named values of the curriculum, β^i among them.
     pub values: BTreeMap<String, f64>,
     /// The curriculum's stage.
@@ -124,6 +128,7 @@ impl PolicyUpdate {
             version,
             policy: Arc::new(policy),
             beta,
+            high_starts: wire.values.get(HIGH_STARTS_VALUE).map_or(0.0, |share| share.clamp(0.0, 1.0)),
             values: wire.values.into_iter().collect(),
             stage: wire.stage,
             env_steps: wire.env_steps,
@@ -292,6 +297,7 @@ mod tests {
             version: PolicyVersion { incarnation: 2, counter: 7 },
             policy: Arc::new(Policy::init(shape, &mut ChaCha8Rng::seed_from_u64(0))),
             beta: 0.95,
+            high_starts: 0.0,
             values: [(BETA_VALUE.to_owned(), 0.95)].into(),
             stage: 1,
             env_steps: 20_000,

@@ -250,6 +250,12 @@ pub struct CurriculumConfig {
     pub beta_std: f64,
     /// An evaluation whose minimum return exceeds it passes the stage, ω.
     pub omega: f64,
+    /// In a stage with β over 1, an evaluation whose mean return exceeds it passes too; `inf` for none.
+    pub omega_above_one: f64,
+    /// Share of the episodes that begin high until the first promotion at a β of 1 or less: standing, collapsing.
+    pub high_starts: f64,
+    /// By how much every such promotion lowers that share.
+    pub high_starts_fade: f64,
     /// Bounds of the env steps that a stage after the first may last.
     pub n_min: u64,
     /// See `n_min`.
@@ -264,6 +270,9 @@ impl Default for CurriculumConfig {
             decay: 0.95,
             beta_std: 0.04,
             omega: 60.0,
+            omega_above_one: f64::INFINITY,
+            high_starts: 0.0,
+            high_starts_fade: 0.1,
             n_min: 300_000,
             n_max: 800_000,
         }
@@ -281,6 +290,12 @@ impl CurriculumConfig {
         check(self.decay > 0.0 && self.decay < 1.0, "curriculum.decay", &self.decay, "between 0 and 1")?;
         check((0.0..=1.0).contains(&self.beta_std), "curriculum.beta_std", &self.beta_std, "from 0 to 1")?;
         check(self.omega.is_finite(), "curriculum.omega", &self.omega, "a number")?;
+        for (key, share) in [
+            ("curriculum.high_starts", self.high_starts),
+            ("curriculum.high_starts_fade", self.high_starts_fade),
+        ] {
+            check((0.0..=1.0).contains(&share), key, &share, "from 0 to 1")?;
+        }
         check(self.n_min > 0, "curriculum.n_min", &self.n_min, "at least 1")?;
         check(self.n_min <= self.n_max, "curriculum.n_min", &self.n_min, "at most curriculum.n_max")
     }

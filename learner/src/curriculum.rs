@@ -20,6 +20,8 @@ pub struct StageResult {
     pub env_steps: u64,
     /// The minimum return over the episodes.
     pub min_return: f64,
+    /// Their mean.
+    pub mean_return: f64,
 }
 
 /// What follows from an evaluation.
@@ -112,6 +114,15 @@ impl Curriculum {
         env_steps.saturating_sub(self.stage_start)
     }
 
+    /// Share of the episodes that begin high in this stage.
+    pub fn high_starts(&self) -> f64 {
+        let CurriculumConfig { beta_start, decay, high_starts, high_starts_fade, .. } = self.config;
+        // Promotions that lead from `beta_start` down to 1.
+        let above = if beta_start > 1.0 { (-beta_start.ln() / decay.ln()).ceil() } else { 0.0 };
+        let promotions = (f64::from(self.stage) - above).max(0.0);
+        (high_starts - high_starts_fade * promotions).max(0.0)
+    }
+
     /// β of the last stage that passed; none before the first promotion.
     pub fn passed(&self) -> Option<f64> {
         self.passed
@@ -129,7 +140,8 @@ impl Curriculum {
             return Decision::Ignore;
         }
         let steps = self.stage_steps(result.env_steps);
-        if result.min_return > self.config.omega {
+        let early = self.beta > 1.0 && result.mean_return > self.config.omega_above_one;
+        if early || result.min_return > self.config.omega {
             self.pass(steps, now)
         } else if self.stage_limit.is_some_and(|limit| steps > limit) {
             // A stage with a limit follows one that passed.
@@ -175,7 +187,7 @@ mod tests {
     }
 
     fn result(stage: u32, env_steps: u64, min_return: f64) -> StageResult {
-        StageResult { stage, env_steps, min_return }
+        StageResult { stage, env_steps, min_return, mean_return: min_return }
     }
 
     #[test]

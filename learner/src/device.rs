@@ -32,7 +32,7 @@ pub use tch::Device;
 /// in the process.
 pub fn open(device: Configured, threads: usize) -> Result<Device, DeviceError> {
     let opened = match device {
-        Configured::Cpu => Device::Cpu,
+        Configured::Cpu => return Ok(cpu(threads)),
         Configured::Cuda => {
             open_library(c"libtorch_cuda.so")?;
             if !tch::Cuda::is_available() {
@@ -43,6 +43,12 @@ pub fn open(device: Configured, threads: usize) -> Result<Device, DeviceError> {
     };
     tch::set_num_threads(threads.try_into().unwrap_or(i32::MAX));
     Ok(opened)
+}
+
+/// The processor, with `threads` threads for libtorch: what needs no opening.
+pub fn cpu(threads: usize) -> Device {
+    tch::set_num_threads(threads.try_into().unwrap_or(i32::MAX));
+    Device::Cpu
 }
 
 /// Opens the device and lets it compute something; says what it found.

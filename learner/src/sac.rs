@@ -259,6 +259,15 @@ impl Sac {
         Losses { critic, actor, temperature: self.log_temperature.exp(), entropy, q }
     }
 
+    /// The matrix products of one update on `rows` transitions, at its shapes and in its precision, and nothing else:
+    /// what a benchmark holds [`Sac::update`] against. False where the update goes through autograd.
+    pub fn multiply(&mut self, rows: usize) -> bool {
+        if self.cpu.is_none() && self.device == Device::Cpu {
+            self.cpu = self.lay_out();
+        }
+        self.cpu.as_mut().map(|cpu| cpu.multiply(rows)).is_some()
+    }
+
     fn lay_out(&self) -> Option<CpuUpdate> {
         let [actor, critics, targets] =
             [&self.actor.parameters, &self.critics.parameters, &self.targets.parameters]

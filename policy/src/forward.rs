@@ -5,7 +5,7 @@
 
 use gemm::Parallelism;
 
-use crate::{LOG_STD_MAX, LOG_STD_MIN, Linear, ObservationStatistics, Policy};
+use crate::{Body, LOG_STD_MAX, LOG_STD_MIN, NORM_EPSILON, ObservationStatistics, Policy};
 
 /// Rows of one matrix product.
 const TILE: usize = 16;
@@ -27,15 +27,35 @@ pub struct Heads<'a> {
 /// A policy laid out for evaluation, with its scratch memory: nothing is allocated in [`Forward::run`] but where
 /// a batch is larger than any before.
 pub struct Forward {
-    layers: Vec<Layer>,
+    body: Vec<Step>,
+    /// Means and log standard deviations.
+    heads: [Layer; 2],
     statistics: Option<ObservationStatistics>,
     observation: usize,
     action: usize,
     /// Two tiles of the widest layer: a layer reads one and writes the other.
     front: Vec<f32>,
     back: Vec<f32>,
+    /// A tile of the widest block's inner activations.
+    inner: Vec<f32>,
     mean: Vec<f32>,
     log_std: Vec<f32>,
+}
+
+/// A step through the body.
+enum Step {
+    /// A layer, and whether a ReLU follows.
+    Dense(Layer, bool),
+    /// A residual block: `x + down(relu(up(norm(x))))`.
+    Block { norm: Norm, up: Layer, down: Layer },
+    /// The layer norm at the end.
+    Norm(Norm),
+}
+
+/// A layer norm.
+struct Norm {
+    weight: Vec<f32>,
+    bias: Vec<f32>,
 }
 
 /// A layer whose weights lie `[inputs, outputs]`, so that the product's left factor is contiguous.
@@ -49,9 +69,11 @@ struct Layer {
 impl Forward {
     /// Lays out `policy` for batches of up to `max_batch` rows (more are possible, and allocate once).
     pub fn new(policy: &Policy, max_batch: usize) -> Self {
-        let layers: Vec<Layer> =
-            policy.shape.layers().iter().map(|layer| Layer::new(layer, policy)).collect();
-        let widest = layers.iter().map(|layer| layer.inputs.max(layer.outputs)).max().unwrap_or(0);
+        let body = steps(policy);
+        let width = policy.shape.body.output_width(policy.shape.observation);
+        let heads = ["head.mean", "head.log_std"].map(|name| Layer::new(name, width, policy));
+        let inner = body.iter().map(Step::widest).max().unwrap_or(0);
+        let widest = inner.max(width).max(policy.shape.observation).max(policy.shape.action);
         let (observation, action) = (policy.shape.observation, policy.shape.action);
         Self {
             statistics: policy.statistics.clone(),
@@ -61,7 +83,9 @@ impl Forward {
             back: vec![0.0; TILE * widest],
             mean: Vec::with_capacity(max_batch * action),
             log_std: Vec::with_capacity(max_batch * action),
-            layers,
+            inner: vec![0.0; TILE * inner],
+            body,
+            heads,
         }
     }
 
@@ -86,42 +110,125 @@ impl Forward {
             None => self.front[..observations.len()].copy_from_slice(observations),
         }
         self.front[observations.len()..TILE * self.observation].fill(0.0);
-        let (body, heads) = self.layers.split_at(self.layers.len() - 2);
-        for layer in body {
-            layer.apply(&self.front, &mut self.back);
-            self.back[..TILE * layer.outputs].iter_mut().for_each(|x| *x = x.max(0.0));
-            std::mem::swap(&mut self.front, &mut self.back);
+        for step in &self.body {
+            match step {
+                Step::Dense(layer, relu) => {
+                    layer.apply(&self.front, &mut self.back, false);
+                    if *relu {
+                        self.back[..TILE * layer.outputs].iter_mut().for_each(|x| *x = x.max(0.0));
+                    }
+                    std::mem::swap(&mut self.front, &mut self.back);
+                }
+                Step::Block { norm, up, down } => {
+                    norm.apply(&self.front, &mut self.back);
+                    up.apply(&self.back, &mut self.inner, false);
+                    self.inner[..TILE * up.outputs].iter_mut().for_each(|x| *x = x.max(0.0));
+                    down.apply(&self.inner, &mut self.front, true);
+                }
+                Step::Norm(norm) => {
+                    norm.apply(&self.front, &mut self.back);
+                    std::mem::swap(&mut self.front, &mut self.back);
+                }
+            }
         }
+        let heads = &self.heads;
         let outputs = rows * self.action;
-        heads[0].apply(&self.front, &mut self.back);
+        heads[0].apply(&self.front, &mut self.back, false);
         self.mean.extend_from_slice(&self.back[..outputs]);
-        heads[1].apply(&self.front, &mut self.back);
+        heads[1].apply(&self.front, &mut self.back, false);
         let squashed = |x: &f32| LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (x.tanh() + 1.0);
         self.log_std.extend(self.back[..outputs].iter().map(squashed));
     }
 }
 
+/// The body's steps, in order.
+fn steps(policy: &Policy) -> Vec<Step> {
+    let inputs = policy.shape.observation;
+    match &policy.shape.body {
+        Body::Mlp { hidden } => {
+            let widths = std::iter::once(&inputs).chain(hidden);
+            let layer = |(index, width): (usize, &usize)| {
+                Step::Dense(Layer::new(&format!("body.{index}"), *width, policy), true)
+            };
+            widths.take(hidden.len()).enumerate().map(layer).collect()
+        }
+        Body::Simba { width, blocks } => {
+            let mut steps = vec![Step::Dense(Layer::new("body.embed", inputs, policy), false)];
+            steps.extend((0..*blocks).map(|block| Step::Block {
+                norm: Norm::new(&format!("body.{block}.norm"), policy),
+                up: Layer::new(&format!("body.{block}.up"), *width, policy),
+                down: Layer::new(&format!("body.{block}.down"), 4 * width, policy),
+            }));
+            steps.push(Step::Norm(Norm::new("body.norm", policy)));
+            steps
+        }
+    }
+}
+
+impl Step {
+    /// The widest row that it reads or writes.
+    fn widest(&self) -> usize {
+        match self {
+            Self::Dense(layer, _) => layer.inputs.max(layer.outputs),
+            Self::Block { up, .. } => up.outputs,
+            Self::Norm(norm) => norm.weight.len(),
+        }
+    }
+}
+
+impl Norm {
+    fn new(name: &str, policy: &Policy) -> Self {
+        let tensor = |part: &str| policy.tensor(&format!("{name}.{part}")).to_vec();
+        Self { weight: tensor("weight"), bias: tensor("bias") }
+    }
+
+    /// Normalises the rows of one tile.
+    fn apply(&self, from: &[f32], to: &mut [f32]) {
+        let width = self.weight.len();
+        let scale = 1.0 / width as f32;
+        for (from, to) in from.chunks_exact(width).zip(to.chunks_exact_mut(width)).take(TILE) {
+            let mean = sum(from.iter().copied()) * scale;
+            let variance = sum(from.iter().map(|x| (x - mean) * (x - mean))) * scale;
+            let inverse = 1.0 / (variance + NORM_EPSILON).sqrt();
+            let parameters = self.weight.iter().zip(&self.bias);
+            for ((to, from), (weight, bias)) in to.iter_mut().zip(from).zip(parameters) {
+                *to = (from - mean) * inverse * weight + bias;
+            }
+        }
+    }
+}
+
+/// A sum in sixteen independent parts, which vectorises.
+fn sum(values: impl ExactSizeIterator<Item = f32>) -> f32 {
+    let mut parts = [0.0f32; 16];
+    values.enumerate().for_each(|(index, value)| parts[index % 16] += value);
+    parts.iter().sum()
+}
+
 impl Layer {
-    fn new(layer: &Linear, policy: &Policy) -> Self {
-        let (inputs, outputs) = (layer.inputs, layer.outputs);
-        let weight = policy.tensor(&format!("{}.weight", layer.name));
+    fn new(name: &str, inputs: usize, policy: &Policy) -> Self {
+        let weight = policy.tensor(&format!("{name}.weight"));
+        let outputs = weight.len() / inputs;
         let mut transposed = vec![0.0; weight.len()];
         for (row, values) in weight.chunks_exact(inputs).enumerate() {
             for (column, value) in values.iter().enumerate() {
                 transposed[column * outputs + row] = *value;
             }
         }
-        let bias = policy.tensor(&format!("{}.bias", layer.name)).to_vec();
+        let bias = policy.tensor(&format!("{name}.bias")).to_vec();
         Self { inputs, outputs, weight: transposed, bias }
     }
 
-    /// `to = from · W + b` for one tile: `from` is `[TILE, inputs]`, `to` is `[TILE, outputs]`.
-    fn apply(&self, from: &[f32], to: &mut [f32]) {
+    /// `to = from · W + b` for one tile, or `to += from · W + b`: `from` is `[TILE, inputs]`, `to` `[TILE, outputs]`.
+    fn apply(&self, from: &[f32], to: &mut [f32], add: bool) {
         let (inputs, outputs) = (self.inputs, self.outputs);
         let from = &from[..TILE * inputs];
         let to = &mut to[..TILE * outputs];
         for row in to.chunks_exact_mut(outputs) {
-            row.copy_from_slice(&self.bias);
+            match add {
+                true => row.iter_mut().zip(&self.bias).for_each(|(x, bias)| *x += bias),
+                false => row.copy_from_slice(&self.bias),
+            }
         }
         // SAFETY: seen as column-major, `to` is outputs × TILE, the weights outputs × inputs, `from` inputs × TILE;
         // the three slices have exactly these sizes and `to` overlaps neither of the others.

@@ -17,5 +17,5 @@ mod statistics;
 
 pub use file::{ModelError, Policy};
 pub use forward::{Forward, Heads, squash};
-pub use shape::{Body, LOG_STD_MAX, LOG_STD_MIN, Linear, NORM_EPSILON, PolicyShape};
+pub use shape::{Body, LOG_STD_MAX, LOG_STD_MIN, NORM_EPSILON, PolicyShape};
 pub use statistics::ObservationStatistics;

@@ -42,35 +42,7 @@ pub struct PolicyShape {
     pub body: Body,
 }
 
-/// One fully connected layer, `y = W x + b`, with `W` of shape `[outputs, inputs]`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Linear {
-    /// The stem of its tensors' names: `<name>.weight`, `<name>.bias`.
-    pub name: String,
-    /// Width of what it reads.
-    pub inputs: usize,
-    /// Width of what it gives.
-    pub outputs: usize,
-}
-
-impl Linear {
-    fn new(name: String, inputs: usize, outputs: usize) -> Self {
-        Self { name, inputs, outputs }
-    }
-}
-
 impl Body {
-    /// The body's layers for an input of width `inputs`, in order.
-    pub fn layers(&self, inputs: usize) -> Vec<Linear> {
-        let Body::Mlp { hidden } = self else { unreachable!() };
-        let widths = std::iter::once(&inputs).chain(hidden);
-        widths
-            .zip(hidden)
-            .enumerate()
-            .map(|(index, (&from, &to))| Linear::new(format!("body.{index}"), from, to))
-            .collect()
-    }
-
     /// Width of what the body gives to the heads.
     pub fn output_width(&self, inputs: usize) -> usize {
         match self {
@@ -87,9 +59,10 @@ impl Body {
             tensors.push((format!("{name}.bias"), vec![to]));
         };
         match self {
-            Body::Mlp { .. } => {
-                for layer in self.layers(inputs) {
-                    linear(&layer.name, layer.inputs, layer.outputs);
+            Body::Mlp { hidden } => {
+                let widths = std::iter::once(&inputs).chain(hidden);
+                for (index, (from, to)) in widths.zip(hidden).enumerate() {
+                    linear(&format!("body.{index}"), *from, *to);
                 }
             }
             Body::Simba { width, blocks } => {
@@ -107,16 +80,6 @@ impl Body {
 }
 
 impl PolicyShape {
-    /// All layers: the body's in order, then `head.mean` and `head.log_std`.
-    pub fn layers(&self) -> Vec<Linear> {
-        let mut layers = self.body.layers(self.observation);
-        let width = self.body.output_width(self.observation);
-        for head in ["head.mean", "head.log_std"] {
-            layers.push(Linear::new(head.to_owned(), width, self.action));
-        }
-        layers
-    }
-
     /// Names and shapes of all tensors, in order.
     pub fn tensors(&self) -> Vec<(String, Vec<usize>)> {
         let mut tensors = self.body.tensors(self.observation);

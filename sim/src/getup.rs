@@ -2,7 +2,7 @@
 
 use crate::config::{Stand, TaskConfig};
 use crate::error::SimError;
-use crate::reset::{Fall, Resets, Source};
+use crate::reset::{Fall, Resets, Source, Standing};
 use crate::task::Task;
 use crate::tolerance::{Sigmoid, tolerance};
 use crate::world::{Body, World};
@@ -12,6 +12,31 @@ const DROP_HEIGHT: f64 = 1.5;
 
 /// Head height of a standing character, in metres.
 const STAND_HEIGHT: f64 = 1.55;
+
+/// The standing pose (the slower stage's target), hinge by hinge, in radians.
+const STANDING_POSE: [(&str, f64); 21] = [
+    ("abdomen_z", 0.0),
+    ("abdomen_y", -0.11665),
+    ("abdomen_x", 0.0),
+    ("right_hip_x", -0.03601),
+    ("right_hip_z", -0.03219),
+    ("right_hip_y", 0.05025),
+    ("right_knee", -0.39803),
+    ("right_ankle_y", -0.30198),
+    ("right_ankle_x", 0.13615),
+    ("left_hip_x", -0.03601),
+    ("left_hip_z", -0.03219),
+    ("left_hip_y", 0.05025),
+    ("left_knee", -0.39803),
+    ("left_ankle_y", -0.30198),
+    ("left_ankle_x", -0.13615),
+    ("right_shoulder1", 0.40763),
+    ("right_shoulder2", -0.41967),
+    ("right_elbow", -1.5795),
+    ("left_shoulder1", -0.40763),
+    ("left_shoulder2", 0.41967),
+    ("left_elbow", -1.5795),
+];
 
 /// Under this height of the centre of mass, in metres, a character need not hold its torso straight.
 const CROUCH_HEIGHT: f64 = 0.5;
@@ -24,6 +49,7 @@ pub struct GetUp {
     control_limit: f64,
     stand: Stand,
     resets: Resets,
+    standing: Standing,
     bodies: Bodies,
     /// What every lane's world is a copy of.
     world: World,
@@ -52,7 +78,16 @@ impl GetUp {
         let [right_hand, right_foot] = [world.body("right_hand")?, world.body("right_foot")?];
         let fall =
             Fall { height: DROP_HEIGHT, limp_steps: config.ragdoll_steps, limp_std: config.ragdoll_std };
+        let angle = |name: String| STANDING_POSE.iter().find(|(hinge, _)| *hinge == name).map_or(0.0, |pose| pose.1);
+        let standing = Standing {
+            hinges: world.hinge_names().into_iter().map(angle).collect(),
+            hinge_std: 0.1,
+            tilt_std: 0.05,
+            limp_share: 0.6,
+            limp_steps: 59,
+        };
         Ok(GetUp {
+            standing,
             physics_hz: config.physics_hz,
             episode_steps: config.episode_steps,
             control_limit,
@@ -121,6 +156,10 @@ impl Task for GetUp {
 
     fn resets(&self) -> &Resets {
         &self.resets
+    }
+
+    fn standing(&self) -> &Standing {
+        &self.standing
     }
 
     /// Hinge angles, head height, 4 × 3 end-effector offsets, 3 + 3 of the torso, velocities, β̂: 68 numbers on the

@@ -113,6 +113,20 @@ impl Lane {
         self.enter();
     }
 
+    /// Begins an episode high: see [`Standing`](crate::Standing). Draws everything from the seed alone.
+    pub fn begin_standing(&mut self, episode_seed: u64, beta: f64) {
+        self.rng = ChaCha8Rng::seed_from_u64(episode_seed);
+        let standing = self.task.standing();
+        standing.draw_pose(&mut self.world, &mut self.rng, &mut self.recording.qpos0);
+        let limp_steps = standing.draw_limp_steps(&mut self.rng);
+        self.recording.qvel0.fill(0.0);
+        // Limp as at the end of a fall.
+        let Source::Fall(fall) = self.task.resets().draw(&mut self.rng);
+        self.fall = (limp_steps > 0).then(|| Fall { limp_steps, ..fall.clone() });
+        self.beta = beta;
+        self.enter();
+    }
+
     /// Begins an episode at a given state, straight in the control phase.
     ///
     /// # Errors
@@ -239,6 +253,11 @@ impl Lane {
         for (out, &value) in observation.iter_mut().zip(&self.observation) {
             *out = value as f32;
         }
+    }
+
+    /// The state in which this phase began: positions and velocities. At a landing, that is the landed state.
+    pub fn phase_start(&self) -> (&[f64], &[f64]) {
+        (&self.recording.qpos0, &self.recording.qvel0)
     }
 
     /// The observation of the state now, in double precision.

@@ -44,7 +44,7 @@ pub use config::{Stand, TaskConfig};
 pub use error::{ConfigError, SimError};
 pub use getup::GetUp;
 pub use lane::{Diverged, Lane, Phase, Step};
-pub use reset::{Fall, Resets, Source};
+pub use reset::{Fall, Resets, Source, Standing};
 pub use task::Task;
 pub use tolerance::{Sigmoid, tolerance};
 pub use world::{Body, Divergence, SavedState, World};

@@ -1,4 +1,5 @@
-//! Where episodes begin: a weighted list of [`Source`]s. A fall is the only one so far.
+//! Where episodes begin: a weighted list of [`Source`]s, of which a fall is the only one so far; and, for training
+//! alone, high starts: [`Standing`].
 
 use rand::Rng;
 use rand::seq::IndexedRandom;
@@ -94,6 +95,51 @@ impl Fall {
         for component in action {
             *component = (self.limp_std * rng.sample::<f64, _>(StandardNormal)) as f32;
         }
+    }
+}
+
+/// A high start: the standing pose, disturbed, on its feet; often limp for some steps, so that training sees all there
+/// is between standing and lying. Evaluations never begin so.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Standing {
+    /// The pose's hinge angles, in qpos order, in radians.
+    pub hinges: Vec<f64>,
+    /// Standard deviation of the noise on every hinge, in radians; the hinge's range clamps it.
+    pub hinge_std: f64,
+    /// Standard deviation of the tilt about each horizontal axis, in radians. The heading is uniform.
+    pub tilt_std: f64,
+    /// Share of the starts that are limp at first.
+    pub limp_share: f64,
+    /// These are limp for 0 to this many control steps, uniformly.
+    pub limp_steps: usize,
+}
+
+impl Standing {
+    /// Draws a pose into `qpos`, its lowest point on the floor. The world's own state is left between poses: set it
+    /// next.
+    ///
+    /// # Panics
+    /// If `qpos` is not the world's `nq` long.
+    pub fn draw_pose(&self, world: &mut World, rng: &mut impl Rng, qpos: &mut [f64]) {
+        let mut normal = |std: f64| std * rng.sample::<f64, _>(StandardNormal);
+        let [tilt_x, tilt_y] = [normal(self.tilt_std), normal(self.tilt_std)];
+        let ranges = world.hinge_ranges().iter().zip(&self.hinges);
+        for (angle, ([lower, upper], mean)) in qpos[7..].iter_mut().zip(ranges) {
+            *angle = (mean + normal(self.hinge_std)).clamp(*lower, *upper);
+        }
+        let yaw = rng.random_range(-std::f64::consts::PI..std::f64::consts::PI);
+        // Heading ∘ tilt: (cos, 0, 0, sin) of half the yaw times the small rotation (1, x/2, y/2, 0), normalised.
+        let (sin, cos) = (yaw / 2.0).sin_cos();
+        let (x, y) = (tilt_x / 2.0, tilt_y / 2.0);
+        let length = (1.0 + x * x + y * y).sqrt();
+        qpos[..3].copy_from_slice(&[0.0; 3]);
+        qpos[3..7].copy_from_slice(&[cos, cos * x - sin * y, cos * y + sin * x, sin].map(|q| q / length));
+        qpos[2] = -world.lowest_point_at(qpos);
+    }
+
+    /// Draws how many control steps the start is limp for.
+    pub fn draw_limp_steps(&self, rng: &mut impl Rng) -> usize {
+        if rng.random_bool(self.limp_share) { rng.random_range(0..=self.limp_steps) } else { 0 }
     }
 }
 

@@ -3,7 +3,7 @@
 //! [`Task`] is the one place to add another. A [`Lane`](crate::Lane) plays episodes of any of them; no width or rate
 //! is a constant outside its task.
 
-use crate::reset::Resets;
+use crate::reset::{Resets, Standing};
 use crate::world::World;
 
 /// A task. It holds no episode: many lanes in many threads share one.
@@ -25,6 +25,9 @@ pub trait Task: Send + Sync {
 
     /// Where episodes begin.
     fn resets(&self) -> &Resets;
+
+    /// How training's high starts begin.
+    fn standing(&self) -> &Standing;
 
     /// Numbers in an observation.
     fn observation_width(&self) -> usize;

@@ -200,6 +200,34 @@ impl World {
         self.contacts() > 0
     }
 
+    /// Height of the lowest point of the character's geoms (capsules and spheres) in a pose, in metres. As after
+    /// [`touches_at`](World::touches_at), [`set`](World::set) must follow before a step.
+    ///
+    /// # Panics
+    /// If `qpos` is not `nq` long.
+    pub fn lowest_point_at(&mut self, qpos: &[f64]) -> f64 {
+        self.data.qpos_mut().copy_from_slice(qpos);
+        self.data.kinematics();
+        let model = self.data.model();
+        let (bodies, sizes, kinds) = (model.geom_bodyid(), model.geom_size(), model.geom_type());
+        let (positions, rotations) = (self.data.geom_xpos(), self.data.geom_xmat());
+        let lowest = |geom: usize| {
+            let [radius, half_length, _] = sizes[geom];
+            // A capsule lies along its z axis.
+            let reach = if kinds[geom] == MjtGeomBase::mjGEOM_CAPSULE { half_length } else { 0.0 };
+            positions[geom][2] - (rotations[geom][8] * reach).abs() - radius
+        };
+        // Body 0 is the world, whose only geom is the floor.
+        (0..bodies.len()).filter(|geom| bodies[*geom] != 0).map(lowest).fold(f64::INFINITY, f64::min)
+    }
+
+    /// Names of the hinges, in qpos order.
+    pub fn hinge_names(&self) -> Vec<String> {
+        let model = self.data.model();
+        let name = |joint| model.id_to_name(MjtObjBase::mjOBJ_JOINT, joint).unwrap_or_default().to_owned();
+        (1..=self.hinge_ranges.len()).map(name).collect()
+    }
+
     /// The number of contacts.
     pub fn contacts(&self) -> usize {
         self.data.contact().len()

@@ -261,6 +261,50 @@ impl Network {
     }
 }
 
+/// Which of an update's products are asked for: see [`Network::multiply`].
+#[derive(Clone, Copy)]
+pub(super) struct Ways {
+    /// Times forward.
+    pub(super) forward: usize,
+    /// Times back to the weights.
+    pub(super) weights: usize,
+    /// Times back to every layer's input.
+    pub(super) inputs: usize,
+    /// The first input whose gradient is asked for; none where it ends at the first layer.
+    pub(super) first: Option<usize>,
+}
+
+impl Network {
+    /// The products of passes over a trace and nothing else, on whatever lies there: what an update cannot do without.
+    pub(super) fn multiply(&self, weights: &[Weights], trace: &mut Trace, ways: Ways, gradient: &mut [f32]) {
+        let Trace { layers, features, head_gradients, front, back, .. } = trace;
+        let mut weights = weights.iter();
+        let mut pass = |linear: &Linear, x: &Operand, y: &Operand, first: Option<usize>| {
+            let weights = weights.next().expect("one for every linear layer");
+            (0..ways.forward).for_each(|_| weights.apply(x, false, back));
+            (0..ways.weights).for_each(|_| weight_gradient(y, x, &mut gradient[linear.weight()]));
+            let Some(first) = first else { return };
+            (0..ways.inputs).for_each(|_| weights.apply_transposed(y, first, false, front));
+        };
+        for (index, (layer, saved)) in self.layers.iter().zip(layers).enumerate() {
+            match layer {
+                Layer::Dense { linear, .. } => {
+                    let first = if index == 0 { ways.first } else { Some(0) };
+                    pass(linear, &saved.input, &saved.result_gradient, first);
+                }
+                Layer::Block { up, down, .. } => {
+                    pass(up, &saved.input, &saved.wide_gradient, Some(0));
+                    pass(down, &saved.activated, &saved.result_gradient, Some(0));
+                }
+                Layer::Norm(_) => {}
+            }
+        }
+        for (head, y) in self.heads.iter().zip(head_gradients) {
+            pass(head, features, y, Some(0));
+        }
+    }
+}
+
 /// The gradients of a linear layer's parameters.
 fn linear_gradient(linear: &Linear, packed: &Operand, values: &[f32], x: &Operand, gradient: &mut [f32]) {
     weight_gradient(packed, x, &mut gradient[linear.weight()]);
@@ -340,8 +384,8 @@ impl Trace {
     pub(super) fn new(network: &Network, rows: usize) -> Self {
         let layers: Vec<Saved> = network.layers.iter().map(|layer| Saved::new(layer, rows)).collect();
         let results = layers.iter().map(|saved| saved.result.len()).max().unwrap_or(0);
-        let widest = results.max(network.width * rows).max(network.inputs * rows);
         let wide = layers.iter().map(|saved| saved.wide.len()).max().unwrap_or(0);
+        let widest = results.max(network.width * rows).max(network.inputs * rows).max(wide);
         let outputs = || network.heads.iter().map(|head| zeros(head.outputs * rows)).collect();
         Self {
             features: Operand::new(Format::F32, network.width, rows),

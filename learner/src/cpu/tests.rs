@@ -1,17 +1,173 @@
+//! The written-out update against autograd, network by network and thread by thread.
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tch::Device;
+
+use super::kernels;
+use super::product::{Format, Operand, Product, Size};
+use crate::config::{NetworkKind, Precision, SacConfig};
+use crate::parameters::to_vec;
+use crate::sac::{Batch, Losses, Sac, TaskShape};
+
+const SHAPE: TaskShape = TaskShape { observation: 13, action: 3, unnormalized: vec![] };
+
+fn random(count: usize, low: f32, high: f32, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    (0..count).map(|_| rng.random_range(low..high)).collect()
+}
+
+fn batch(rows: usize, rng: &mut ChaCha8Rng) -> Batch {
+    Batch {
+        observation: random(rows * SHAPE.observation, -2.0, 2.0, rng),
+        action: random(rows * SHAPE.action, -0.9, 0.9, rng),
+        reward: random(rows, 0.0, 1.0, rng),
+        next_observation: random(rows * SHAPE.observation, -2.0, 2.0, rng),
+        discount: random(rows, 0.0, 0.97, rng),
+        beta: random(rows, 0.4, 1.6, rng),
+    }
+}
+
+/// Networks of every kind, with widths and batches that are no multiples of a vector.
+fn configurations() -> Vec<SacConfig> {
+    let base = SacConfig {
+        actor_lr: 1e-3,
+        critic_lr: 1e-3,
+        temperature_lr: 1e-3,
+        weight_decay: 0.01,
+        normalize_observations: true,
+        precision: Precision::Fp32,
+        ..SacConfig::default()
+    };
+    let mlp = |hidden: &[usize], critics| SacConfig { hidden: hidden.to_vec(), critics, ..base.clone() };
+    let simba = |actor: (usize, usize), critic: (usize, usize), critics| SacConfig {
+        network: NetworkKind::Simba,
+        actor_width: actor.0,
+        actor_blocks: actor.1,
+        critic_width: critic.0,
+        critic_blocks: critic.1,
+        critics,
+        ..base.clone()
+    };
+    vec![
+        mlp(&[32, 32], 2),
+        mlp(&[19, 7, 24], 3),
+        simba((16, 1), (32, 2), 1),
+        simba((9, 2), (17, 1), 2),
+        simba((8, 0), (8, 0), 1),
+    ]
+}
+
+/// Sums of parameters of actor, critics and targets, and what the updates found.
+fn parameters(sac: &Sac) -> Vec<f32> {
+    [&sac.actor.parameters, &sac.critics.parameters, &sac.targets.parameters]
+        .into_iter()
+        .flat_map(|parameters| to_vec(parameters.flat()))
+        .collect()
+}
+
+fn train(config: &SacConfig, threads: usize, rows: usize, autograd: bool) -> (Vec<f32>, Losses) {
+    let mut rng = ChaCha8Rng::seed_from_u64(2);
+    let mut sac = Sac::new(&SHAPE, config, 1, Device::Cpu, threads);
+    let mut losses = Losses::default();
+    for _ in 0..4 {
+        let batch = batch(rows, &mut rng);
+        sac.merge_statistics(&batch);
+        let noise = random(rows * SHAPE.action, -2.0, 2.0, &mut rng);
+        let next_noise = random(rows * SHAPE.action, -2.0, 2.0, &mut rng);
+        losses = match autograd {
+            true => sac.update_by_autograd(&batch, &next_noise, &noise),
+            false => sac.update_with_noise(&batch, &next_noise, &noise),
+        }
+        .unwrap();
+    }
+    (parameters(&sac), losses)
+}
+
+fn largest_difference(a: &[f32], b: &[f32]) -> f32 {
+    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+}
+
 #[test]
-fn quick_timing() {
-    use crate::config::*; use crate::sac::*;
-    for (network, batch, threads) in [(NetworkKind::Simba, 128, 1), (NetworkKind::Simba, 128, 2), (NetworkKind::Simba, 256, 1), (NetworkKind::Mlp, 256, 1)] {
-        for precision in [Precision::Bf16, Precision::Fp32] {
-        let config = SacConfig { network, hidden: vec![256,256], critics: if network == NetworkKind::Simba {1} else {2}, precision, normalize_observations: true, ..SacConfig::default() };
-        let shape = TaskShape { observation: 68, action: 21, unnormalized: vec![67] };
-        let mut sac = Sac::new(&shape, &config, 5, tch::Device::Cpu, threads);
-        let col = |n: usize| (0..batch*n).map(|i| ((i as f32)*0.7).sin()).collect::<Vec<f32>>();
-        let b = Batch { observation: col(68), next_observation: col(68), action: col(21), reward: col(1), discount: vec![0.9; batch], beta: vec![1.0; batch] };
-        for _ in 0..20 { sac.update(&b).unwrap(); }
-        let mut best = f64::MAX;
-        for _ in 0..5 { let t = std::time::Instant::now(); for _ in 0..100 { sac.update(&b).unwrap(); } best = best.min(t.elapsed().as_secs_f64()/100.0); }
-        println!("{network:?} {batch} threads {threads} {precision:?}: {:.0}/s", 1.0/best);
+fn in_float32_four_updates_are_autograds_for_every_network_batch_and_number_of_threads() {
+    for config in configurations() {
+        for (rows, threads) in [(5, 1), (48, 1), (50, 2), (33, 3)] {
+            let (exact, exact_losses) = train(&config, 1, rows, true);
+            let (ours, losses) = train(&config, threads, rows, false);
+            let difference = largest_difference(&exact, &ours);
+            // Adam's first steps divide a gradient by its own size: one near zero may go either way by a rounding.
+            assert!(difference < 2e-4, "{config:?}, {rows} rows, {threads} threads: {difference}");
+            let mean = exact.iter().zip(&ours).map(|(a, b)| (a - b).abs()).sum::<f32>() / ours.len() as f32;
+            assert!(mean < 1e-6, "{config:?}, {rows} rows, {threads} threads: {mean} on average");
+            for (ours, theirs) in [
+                (losses.critic, exact_losses.critic),
+                (losses.actor, exact_losses.actor),
+                (losses.entropy, exact_losses.entropy),
+                (losses.q, exact_losses.q),
+                (losses.temperature, exact_losses.temperature),
+            ] {
+                assert!((ours - theirs).abs() < 1e-4 * theirs.abs().max(1.0), "{losses:?} {exact_losses:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn in_bfloat16_updates_stay_within_its_rounding_of_float32() {
+    for config in configurations() {
+        let bf16 = SacConfig { precision: Precision::Bf16, ..config.clone() };
+        let (exact, exact_losses) = train(&config, 1, 48, false);
+        let (rounded, losses) = train(&bf16, 2, 48, false);
+        let mean = exact.iter().zip(&rounded).map(|(a, b)| (a - b).abs()).sum::<f32>() / exact.len() as f32;
+        assert!(mean > 0.0 && mean < 5e-4, "{config:?}: {mean} on average");
+        assert!((losses.critic - exact_losses.critic).abs() < 0.05 * exact_losses.critic.max(0.1));
+    }
+}
+
+#[test]
+fn the_same_minibatches_give_the_same_bits_on_the_same_number_of_threads() {
+    for config in configurations() {
+        for threads in [1, 2] {
+            assert_eq!(train(&config, threads, 50, false).0, train(&config, threads, 50, false).0);
+        }
+    }
+}
+
+#[test]
+fn a_product_in_bfloat16_is_that_of_the_rounded_numbers() {
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    let (m, n, k) = (5, 16, 7);
+    let (a, b) = (random(m * k, -1.0, 1.0, &mut rng), random(k * n, -1.0, 1.0, &mut rng));
+    let round = |value: f32| f32::from_bits((value.to_bits() + 0x7fff + ((value.to_bits() >> 16) & 1)) & 0xffff_0000);
+    let mut right = Operand::new(Format::Bf16, k, n);
+    right.pack(&b);
+    let mut left = vec![0u32; m * 4];
+    for row in 0..m {
+        for column in 0..k {
+            left[row * 4 + column / 2] |= (round(a[row * k + column]).to_bits() >> 16) << (16 * (column % 2));
+        }
+    }
+    let mut result = vec![0.0; m * n];
+    let product = Product { format: Format::Bf16, size: Size { m, n, k: 8 }, lda: 8, ldb: n, ldc: n, accumulate: false };
+    product.run(&left, &right.pairs, &mut result);
+    for row in 0..m {
+        for column in 0..n {
+            let exact: f32 = (0..k).map(|i| round(a[row * k + i]) * round(b[i * n + column])).sum();
+            assert!((result[row * n + column] - exact).abs() < 1e-5, "[{row}, {column}]");
+        }
+    }
+}
+
+#[test]
+fn words_are_transposed_whatever_the_sides() {
+    for (rows, columns) in [(1, 1), (16, 16), (3, 40), (40, 3), (33, 50), (128, 64)] {
+        let words: Vec<u32> = (0..rows * columns).collect();
+        let mut turned = vec![0; words.len()];
+        let (rows, columns) = (rows as usize, columns as usize);
+        kernels::transpose(&words, rows, columns, &mut turned);
+        for row in 0..rows {
+            for column in 0..columns {
+                assert_eq!(turned[column * rows + row], words[row * columns + column], "{rows} × {columns}");
+            }
         }
     }
 }

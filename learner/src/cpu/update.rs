@@ -7,7 +7,7 @@ use rayon::ThreadPool;
 use rayon::prelude::*;
 
 use super::kernels::{self, AdamStep, LANES, Motor};
-use super::network::{Network, Trace};
+use super::network::{Network, Trace, Ways};
 use super::product::{Aligned, Format, Weights, zeros};
 use crate::sac::Batch;
 
@@ -149,15 +149,26 @@ impl CpuUpdate {
         run(&self.pool, &mut pieces, |piece| piece.step(step, 0.0));
     }
 
-    /// The gradients of the last phases: of the critics and of the actor.
-    #[cfg(test)]
-    pub(super) fn gradients(&self) -> (Vec<f32>, Vec<f32>) {
-        let sum = |of: fn(&Worker) -> &Aligned<f32>| {
-            let mut total = of(&self.workers[0]).to_vec();
-            self.workers[1..].iter().for_each(|worker| kernels::add(&mut total, of(worker)));
-            total
-        };
-        (sum(|worker| &worker.critics_gradient), sum(|worker| &worker.actor_gradient))
+    /// The matrix products of one update on `batch` transitions and nothing else: its limit on this processor.
+    pub(crate) fn multiply(&mut self, batch: usize) {
+        self.lay_out(batch);
+        let Self { pool, actor, critic, actor_weights, critic_weights, target_weights, workers, .. } = self;
+        let first = Some(actor.inputs);
+        run(pool, workers, |worker| {
+            let gradients = worker.critics_gradient.chunks_exact_mut(critic.length);
+            for ((index, trace), gradient) in worker.critics.iter_mut().enumerate().zip(gradients) {
+                // Q'(s', a'); Q(s, a) and back to the weights; Q(s, a ~ π) and back to the actions.
+                let once = Ways { forward: 1, weights: 0, inputs: 0, first: None };
+                critic.multiply(&target_weights[index], trace, once, gradient);
+                let learn = Ways { forward: 1, weights: 1, inputs: 1, first: None };
+                critic.multiply(&critic_weights[index], trace, learn, gradient);
+                let ask = Ways { forward: 1, weights: 0, inputs: 1, first };
+                critic.multiply(&critic_weights[index], trace, ask, gradient);
+            }
+            // π(s'); π(s) and back to the weights.
+            let ways = Ways { forward: 2, weights: 1, inputs: 1, first: None };
+            actor.multiply(actor_weights, &mut worker.actor, ways, &mut worker.actor_gradient);
+        });
     }
 
     /// Divides `batch` transitions over the workers, in whole vectors.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::*;
-use crate::config::{Precision, TargetEntropy};
+use crate::config::{NetworkKind, Precision, TargetEntropy};
 use crate::parameters::Parameters;
 use serde::Deserialize;
 
@@ -146,10 +146,20 @@ fn a_toy_task_is_learned_to_its_known_optimum_normalised_or_not_and_in_both_prec
 
 #[test]
 fn the_actors_forward_pass_agrees_with_the_learners_network_on_every_shape() {
-    for (hidden, observation, action) in
-        [(vec![1024, 1024], 68, 21), (vec![256, 256], 68, 21), (vec![64], 62, 18), (vec![40, 30, 20], 64, 19)]
-    {
-        let config = SacConfig { hidden, normalize_observations: true, ..SacConfig::default() };
+    let mlp = |hidden: &[usize]| SacConfig { hidden: hidden.to_vec(), ..SacConfig::default() };
+    let simba = |actor_width, actor_blocks| {
+        SacConfig { network: NetworkKind::Simba, actor_width, actor_blocks, ..SacConfig::default() }
+    };
+    for (config, observation, action) in [
+        (mlp(&[1024, 1024]), 68, 21),
+        (mlp(&[256, 256]), 68, 21),
+        (mlp(&[64]), 62, 18),
+        (mlp(&[40, 30, 20]), 64, 19),
+        (simba(128, 1), 68, 21),
+        (simba(33, 2), 62, 18),
+        (simba(64, 0), 64, 19),
+    ] {
+        let config = SacConfig { normalize_observations: true, ..config };
         let shape = TaskShape { observation, action, unnormalized: vec![observation - 1] };
         let mut sac = Sac::new(&shape, &config, 5, Device::Cpu, 1);
         let mut rng = ChaCha8Rng::seed_from_u64(6);

@@ -30,7 +30,11 @@ impl Trainer {
         let update = Arc::new(v1::PolicyUpdate {
             version: Some(self.version.into()),
             networks: vec![v1::NamedNetwork { name: "policy".into(), model: policy.to_bytes().into() }],
-            values: [("beta".to_owned(), self.curriculum.beta())].into(),
+            values: [
+                ("beta".to_owned(), self.curriculum.beta()),
+                ("high_starts".to_owned(), self.curriculum.high_starts()),
+            ]
+            .into(),
             stage: self.curriculum.stage(),
             env_steps: self.progress.env_steps,
             uniform: self.progress.env_steps < self.config.sac.uniform_steps && self.sac.updates() == 0,

@@ -78,7 +78,7 @@ impl Trainer {
         self.metrics.evaluation_return_min.set(min);
         let env_steps = policy.env_steps;
         self.evaluation = Some(v1::EvaluationSummary { version: policy.version, env_steps, mean, min, beta });
-        let result = StageResult { stage, env_steps, min_return: min };
+        let result = StageResult { stage, env_steps, min_return: min, mean_return: mean };
         let decision = self.curriculum.report(result, self.progress.env_steps);
         self.decided(decision, evaluation, (mean, min))
     }

@@ -43,6 +43,7 @@ pub(crate) fn update(counter: u64) -> PolicyUpdate {
         version: PolicyVersion { incarnation: 1, counter },
         policy: Arc::new(policy(counter)),
         beta: 0.8,
+        high_starts: 0.0,
         values: [("beta".to_owned(), 0.8)].into(),
         stage: 3,
         env_steps: 0,
