@@ -103,9 +103,11 @@ impl<'a> Side<'a> {
             weight_decay: if simba { 0.01 } else { 0.0 },
             ..SacConfig::default()
         };
-        let shape = TaskShape { observation: OBSERVATION, action: ACTION, unnormalized: vec![OBSERVATION - 1] };
+        let shape =
+            TaskShape { observation: OBSERVATION, action: ACTION, unnormalized: vec![OBSERVATION - 1] };
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        let mut column = |width: usize| (0..case.batch * width).map(|_| rng.random_range(-1.0..1.0)).collect();
+        let mut column =
+            |width: usize| (0..case.batch * width).map(|_| rng.random_range(-1.0..1.0)).collect();
         let batch = Batch {
             observation: column(OBSERVATION),
             next_observation: column(OBSERVATION),

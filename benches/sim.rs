@@ -10,10 +10,9 @@ mod common;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use common::{Row, median, report};
+use common::{Bare, Row, Side, alternate, report};
 use getup_sim::falls::{self, Landed};
 use getup_sim::{GetUp, Lane, Task, TaskConfig};
-use mujoco_rs::prelude::{MjData, MjModel};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -34,73 +33,35 @@ fn main() -> anyhow::Result<()> {
 fn measure(physics_hz: u32) -> anyhow::Result<Row> {
     let config = TaskConfig { physics_hz, ..TaskConfig::default() };
     let states = falls::draw(&config, STATES, 0)?.falls;
-    let task = Arc::new(GetUp::new(&config, 1.0)?);
+    let task: Arc<dyn Task> = Arc::new(GetUp::new(&config, 1.0)?);
     let mut lane = Lane::new(task.clone());
-    let mut bare = task.world().mujoco().clone();
-    let mut rng = ChaCha8Rng::seed_from_u64(0);
-    let [mut ours, mut limits, mut shares] = [const { Vec::new() }; 3];
-    let start = Instant::now();
-    for pair in 0.. {
-        if start.elapsed() > TIME {
-            break;
-        }
+    let mut bare = Bare::new(&*task);
+    let comparison = alternate(TIME, |side, pair| {
         let state = &states[pair % STATES];
-        let actions: Vec<Vec<f32>> = (0..STEPS)
-            .map(|_| (0..task.action_width()).map(|_| rng.random_range(-1.0..=1.0)).collect())
-            .collect();
-        // Whoever goes second finds the caches warm: take turns in that too.
-        let (our, limit);
-        if pair % 2 == 0 {
-            our = time_lane(&mut lane, state, &actions)?;
-            limit = time_bare(&mut bare, state, &actions, task.substeps());
-        } else {
-            limit = time_bare(&mut bare, state, &actions, task.substeps());
-            our = time_lane(&mut lane, state, &actions)?;
-        }
-        ours.push(our);
-        limits.push(limit);
-        shares.push(our / limit);
-    }
-    Ok(Row {
-        name: format!("lane, {physics_hz} Hz physics"),
-        unit: "control steps/s".to_owned(),
-        ours: median(ours),
-        peer: None,
-        limit: Some(median(limits)),
-        ratio_to_peer: None,
-        share_of_limit: Some(median(shares)),
-    })
+        let mut rng = ChaCha8Rng::seed_from_u64(pair as u64);
+        let actions: Vec<f32> =
+            (0..STEPS * task.action_width()).map(|_| rng.random_range(-1.0..=1.0)).collect();
+        let time = match side {
+            Side::Ours => time_lane(&mut lane, state, &actions)?,
+            Side::Theirs => bare.time(state, &actions),
+        };
+        Ok(STEPS as f64 / time.as_secs_f64())
+    })?;
+    Ok(comparison.with_limit(format!("lane, {physics_hz} Hz physics"), "control steps/s"))
 }
 
-/// Control steps a second of the lane, from `state` under `actions`.
-fn time_lane(lane: &mut Lane, state: &Landed, actions: &[Vec<f32>]) -> anyhow::Result<f64> {
+/// How long the lane takes from `state` on, under `actions`, one row of torques a control step.
+fn time_lane(lane: &mut Lane, state: &Landed, actions: &[f32]) -> anyhow::Result<Duration> {
     lane.begin_at(&state.qpos, &state.qvel, 1.0)?;
     let mut observation = vec![0.0; lane.observation().len()];
+    let width = lane.world().nu();
     let mut paid = 0.0;
     let start = Instant::now();
-    for action in actions {
+    for action in actions.chunks_exact(width) {
         paid += lane.step(action)?.reward;
         lane.observe(&mut observation);
         std::hint::black_box(&observation);
     }
     std::hint::black_box(paid);
-    Ok(actions.len() as f64 / start.elapsed().as_secs_f64())
-}
-
-/// The same of `mj_step` alone.
-fn time_bare(data: &mut MjData<Arc<MjModel>>, state: &Landed, actions: &[Vec<f32>], substeps: usize) -> f64 {
-    data.reset();
-    data.qpos_mut().copy_from_slice(&state.qpos);
-    data.qvel_mut().copy_from_slice(&state.qvel);
-    data.forward();
-    let start = Instant::now();
-    for action in actions {
-        for (control, &component) in data.ctrl_mut().iter_mut().zip(action) {
-            *control = f64::from(component);
-        }
-        for _ in 0..substeps {
-            data.step();
-        }
-    }
-    actions.len() as f64 / start.elapsed().as_secs_f64()
+    Ok(start.elapsed())
 }

@@ -1,13 +1,14 @@
 //! Compiles the shim to a matrix product of libtorch that tch does not expose.
 
-use std::path::PathBuf;
-
 fn main() {
     println!("cargo::rerun-if-changed=src/cpu/brgemm.cc");
     println!("cargo::rerun-if-env-changed=LIBTORCH");
-    if std::env::var_os("CARGO_FEATURE_TORCH").is_none() {
-        return;
-    }
+    #[cfg(feature = "torch")]
+    compile();
+}
+
+#[cfg(feature = "torch")]
+fn compile() {
     let Some(libtorch) = std::env::var_os("LIBTORCH") else {
         panic!("LIBTORCH is not set: `cargo xtask setup` installs libtorch and notes its place");
     };
@@ -16,7 +17,7 @@ fn main() {
         .std("c++17")
         .define("_GLIBCXX_USE_CXX11_ABI", "1")
         .warnings(false)
-        .include(PathBuf::from(libtorch).join("include"))
+        .include(std::path::PathBuf::from(libtorch).join("include"))
         .file("src/cpu/brgemm.cc")
         .compile("getup_brgemm");
 }

@@ -1,7 +1,7 @@
 //! `getup evaluate`: a trained policy on falls it has not seen.
 
 use std::ops::ControlFlow;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 use getup_actor::evaluate::{EvaluatedEpisode, Evaluator};
@@ -67,20 +67,10 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         "--episodes {}: from 1 to 1000000",
         arguments.episodes
     );
-    let policy = Policy::load(&arguments.model).with_context(|| arguments.model.display().to_string())?;
-    let Some(beta) = arguments.beta.or_else(|| policy.number("beta")) else {
-        bail!("the model names no beta: give one with --beta");
-    };
-    let character = match (arguments.character, policy.metadata.get("character")) {
-        (Some(character), _) => character,
-        (None, Some(name)) => name.parse().with_context(|| "the model's metadata")?,
-        (None, None) => Character::Standard,
-    };
+    let Actor { policy, beta, character } = Actor::load(&arguments.model, arguments.beta, arguments.character)?;
     let task = TaskConfig { character, ..TaskConfig::default() };
     let mut evaluator = Evaluator::new(&task, beta.max(1.0), LANES.min(arguments.episodes))?;
-    let seeds: Vec<u64> = (0..arguments.episodes as u64)
-        .map(|index| arguments.seed.wrapping_mul(SEED_STRIDE).wrapping_add(index))
-        .collect();
+    let seeds = unseen_falls(arguments.seed, arguments.episodes);
     let bar = progress_bar(arguments.episodes as u64, "falls");
     let progress = |done: usize| {
         bar.set_position(done as u64);
@@ -105,6 +95,33 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         eprintln!("Episodes written to {}", path.display());
     }
     Ok(())
+}
+
+/// A model with what it is asked to act under: its own character and β, unless others are given.
+pub(crate) struct Actor {
+    pub(crate) policy: Policy,
+    pub(crate) beta: f64,
+    pub(crate) character: Character,
+}
+
+impl Actor {
+    pub(crate) fn load(model: &Path, beta: Option<f64>, character: Option<Character>) -> Result<Self> {
+        let policy = Policy::load(model).with_context(|| model.display().to_string())?;
+        let Some(beta) = beta.or_else(|| policy.number("beta")) else {
+            bail!("the model names no beta: give one with --beta");
+        };
+        let character = match (character, policy.metadata.get("character")) {
+            (Some(character), _) => character,
+            (None, Some(name)) => name.parse().with_context(|| "the model's metadata")?,
+            (None, None) => Character::Standard,
+        };
+        Ok(Self { policy, beta, character })
+    }
+}
+
+/// Seeds of the first `count` falls of `seed`, which no run draws.
+pub(crate) fn unseen_falls(seed: u64, count: usize) -> Vec<u64> {
+    (0..count as u64).map(|index| seed.wrapping_mul(SEED_STRIDE).wrapping_add(index)).collect()
 }
 
 fn summarize(episodes: &[EvaluatedEpisode], beta: f64, character: Character, seed: u64) -> Report {

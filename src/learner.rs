@@ -10,7 +10,7 @@ use getup_learner::hub::Hub;
 use getup_learner::run_folder::{RunFolder, write_atomically};
 use getup_learner::sac::TaskShape;
 use getup_learner::service::service;
-use getup_learner::trainer::{Ending, Trainer, TrainerConfig};
+use getup_learner::trainer::{Ending, Start, Trainer, TrainerConfig};
 use getup_replay::{RemoteOptions, RemoteSource, SampleOptions};
 use getup_sim::{GetUp, Task};
 use getup_telemetry::health;
@@ -51,7 +51,7 @@ async fn serve(config: &Config, role: &Role, folder: RunFolder, device: Device) 
     let listener = bind(address, "gRPC").await?;
     tracing::info!("learner serves gRPC at {}", listener.local_addr()?);
     let mut trainer =
-        make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, true)?;
+        make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, Start::Newest)?;
     write_atomically(&folder.config(), config.to_toml()?.as_bytes())?;
     role.serve_metrics(&config.network.learner_metrics).await?;
     let (_reporter, health) = health();
@@ -109,7 +109,7 @@ fn evaluation_seeds(run_seed: u64, episodes: usize) -> Vec<u64> {
     (0..episodes).map(|_| rng.next_u64()).collect()
 }
 
-/// The trainer of this run, on its newest checkpoint where it resumes.
+/// The trainer of this run.
 pub(crate) fn make_trainer(
     config: &Config,
     role: &Role,
@@ -117,7 +117,7 @@ pub(crate) fn make_trainer(
     hub: Arc<Hub>,
     incarnation: u64,
     device: Device,
-    resume: bool,
+    start: Start<'_>,
 ) -> Result<Trainer> {
     let task = GetUp::new(&config.task, config.control_limit())?;
     let observation = task.observation_width();
@@ -133,7 +133,7 @@ pub(crate) fn make_trainer(
         evaluation: config.evaluation.clone(),
         learner: config.learner.clone(),
     };
-    Ok(Trainer::new(trainer, folder, hub, incarnation, resume, device, &role.registry)?)
+    Ok(Trainer::new(trainer, folder, hub, incarnation, start, device, &role.registry)?)
 }
 
 /// How the learner samples; each of its starts draws other minibatches.

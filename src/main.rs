@@ -13,6 +13,8 @@ mod learner;
 #[cfg(feature = "learner")]
 mod links;
 mod output;
+#[cfg(feature = "render")]
+mod render;
 mod replay;
 mod role;
 mod rollout;
@@ -49,6 +51,9 @@ enum Command {
     Actor(actor::Args),
     /// Measure a trained policy on falls it has not seen.
     Evaluate(evaluate::Args),
+    /// Draw a strip of frames of one get-up.
+    #[cfg(feature = "render")]
+    Render(render::Args),
     /// Replay recorded states and actions, and write what the simulation makes of them.
     Rollout(rollout::Args),
     /// Write the states in which falls begin and end.
@@ -68,6 +73,8 @@ fn main() -> ExitCode {
         Command::Learner(arguments) => learner::run(arguments),
         Command::Actor(arguments) => actor::run(arguments),
         Command::Evaluate(arguments) => evaluate::run(arguments),
+        #[cfg(feature = "render")]
+        Command::Render(arguments) => render::run(arguments),
         Command::Rollout(arguments) => rollout::run(arguments),
         Command::Falls(arguments) => falls::run(arguments),
         Command::Doctor(arguments) => doctor::run(arguments),

@@ -13,7 +13,7 @@ use getup_learner::config::Device;
 use getup_learner::curriculum::Outcome;
 use getup_learner::device;
 use getup_learner::run_folder::{RunFolder, write_atomically};
-use getup_learner::trainer::Ending;
+use getup_learner::trainer::{Ending, Start};
 use getup_replay::{LocalSource, ReplayMetrics, Store};
 use getup_telemetry::LogFormat;
 
@@ -35,6 +35,10 @@ pub(crate) struct Args {
     /// Go on with the run in that folder, under its own config.toml.
     #[arg(long)]
     resume: bool,
+    /// Begin a new run with the networks of this checkpoint instead of untrained ones: a file of another run's
+    /// checkpoints/. Its curriculum and its env steps begin anew.
+    #[arg(long, value_name = "FILE", conflicts_with = "resume")]
+    from: Option<PathBuf>,
     /// Every random draw comes from it. [default: 0]
     #[arg(long)]
     seed: Option<u64>,
@@ -56,13 +60,18 @@ pub(crate) struct Args {
 
 pub(crate) fn run(mut arguments: Args) -> Result<()> {
     let (config, folder) = prepare(&mut arguments)?;
+    let start = match (&arguments.from, arguments.resume) {
+        (Some(checkpoint), _) => Start::Checkpoint(checkpoint),
+        (None, true) => Start::Newest,
+        (None, false) => Start::Untrained,
+    };
     let role = Role::new("train", arguments.log_format)?;
     let ending = if arguments.deterministic {
         role.run(async {
-            tokio::task::block_in_place(|| deterministic::train(&config, &role, &folder, arguments.resume))
+            tokio::task::block_in_place(|| deterministic::train(&config, &role, &folder, start))
         })
     } else {
-        role.run(train(&config, &role, &folder, arguments.resume))
+        role.run(train(&config, &role, &folder, start))
     }?;
     conclude(ending, &folder);
     Ok(())
@@ -151,7 +160,7 @@ fn name_after_folder(config: &mut Config, path: &Path) {
     }
 }
 
-async fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bool) -> Result<Ending> {
+async fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_>) -> Result<Ending> {
     let device = device::open(config.learner.device, config.learner.effective_threads())?;
     serve_metrics(config, role).await?;
     let spec = config.run_spec()?;
@@ -159,7 +168,7 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bool) -
     let store = open_store(config, role, folder)?;
     let (hub, incarnation) = make_hub(config, role, folder)?;
     let mut trainer =
-        make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, resume)?;
+        make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, start)?;
     let options = sample_options(config, incarnation);
     let mut source = LocalSource::new(Arc::clone(&store), options, "learner", role.shutdown.clone())?;
     note_config(config, folder)?;
@@ -219,6 +228,9 @@ fn conclude(ending: Ending, folder: &RunFolder) {
         }
         Ending::Curriculum(Outcome::StageOutlasted { beta }) => {
             println!("Done: the curriculum is over, the weakest stage passed has β = {beta:.3}.");
+        }
+        Ending::Curriculum(Outcome::Settled { beta }) => {
+            println!("Done: at β = {beta:.3} no evaluation was better than the best for long.");
         }
         Ending::Steps(steps) => println!("Done: {steps} env steps{}.", last_evaluation(folder)),
         Ending::Shutdown => {

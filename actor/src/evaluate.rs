@@ -63,6 +63,8 @@ impl EvaluatedEpisode {
             episode_return: self.episode_return,
             max_head_height: self.max_head_height(),
             final_head_height: self.final_head_height(),
+            rises: self.rises(),
+            stands: self.stands(),
         }
     }
 }

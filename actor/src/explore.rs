@@ -107,10 +107,47 @@ mod tests {
         ) {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let mut action = [0.0; 4];
-            sample_action(&mean, &[log_std; 4], beta, &mut rng, &mut action);
+            let mut noise = Noise::new(4, 1);
+            sample_action(&mean, &[log_std; 4], noise.next(&mut rng), beta, &mut action);
             prop_assert!(action.iter().all(|component| component.abs() <= beta));
             uniform_action(beta, &mut rng, &mut action);
             prop_assert!(action.iter().all(|component| component.abs() <= beta));
+        }
+    }
+
+    #[test]
+    fn noise_is_held_for_a_time_that_falls_off_with_its_square() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut noise = Noise::new(2, 16);
+        let mut holds = [0; 17];
+        let (mut last, mut held) = (noise.next(&mut rng).to_vec(), 1);
+        for _ in 0..200_000 {
+            let next = noise.next(&mut rng).to_vec();
+            if next == last {
+                held += 1;
+            } else {
+                holds[held] += 1;
+                (last, held) = (next, 1);
+            }
+        }
+        let total: i32 = holds.iter().sum();
+        let normaliser: f64 = (1..=16).map(|k| f64::from(k).powi(-2)).sum();
+        for (k, count) in holds.iter().enumerate().skip(1) {
+            let (share, wanted) = (f64::from(*count) / f64::from(total), (k as f64).powi(-2) / normaliser);
+            assert!((share - wanted).abs() < 0.005, "held {k}: {share}, wanted {wanted}");
+        }
+    }
+
+    #[test]
+    fn noise_that_is_not_held_is_drawn_anew_in_every_step_and_release_ends_a_hold() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut anew = Noise::new(3, 1);
+        assert_ne!(anew.next(&mut rng).to_vec(), anew.next(&mut rng).to_vec());
+        let mut held = Noise::new(3, 16);
+        for _ in 0..100 {
+            let before = held.next(&mut rng).to_vec();
+            held.release();
+            assert_ne!(held.next(&mut rng).to_vec(), before);
         }
     }
 

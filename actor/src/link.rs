@@ -211,6 +211,10 @@ pub struct EpisodeResult {
     pub max_head_height: f64,
     /// Where the head was at the end, in metres.
     pub final_head_height: f64,
+    /// Whether the head was up at any step: see [`crate::evaluate::EvaluatedEpisode::rises`].
+    pub rises: bool,
+    /// Whether it was up through the last steps: see [`crate::evaluate::EvaluatedEpisode::stands`].
+    pub stands: bool,
 }
 
 impl From<EpisodeResult> for v1::EpisodeResult {
@@ -219,6 +223,8 @@ impl From<EpisodeResult> for v1::EpisodeResult {
             episode_return: result.episode_return,
             max_head_height: result.max_head_height,
             final_head_height: result.final_head_height,
+            rises: result.rises,
+            stands: result.stands,
         }
     }
 }

@@ -192,7 +192,9 @@ impl SacConfig {
         for (key, width) in [("sac.actor_width", self.actor_width), ("sac.critic_width", self.critic_width)] {
             check((1..=4096).contains(&width), key, &width, "from 1 to 4096")?;
         }
-        for (key, blocks) in [("sac.actor_blocks", self.actor_blocks), ("sac.critic_blocks", self.critic_blocks)] {
+        for (key, blocks) in
+            [("sac.actor_blocks", self.actor_blocks), ("sac.critic_blocks", self.critic_blocks)]
+        {
             check(blocks <= 64, key, &blocks, "from 0 to 64")?;
         }
         check((1..=16).contains(&self.critics), "sac.critics", &self.critics, "from 1 to 16")?;
@@ -211,7 +213,12 @@ impl SacConfig {
         let alpha = self.initial_temperature;
         check(alpha > 0.0 && alpha.is_finite(), "sac.initial_temperature", &alpha, "over 0")?;
         let floor = self.temperature_floor;
-        check((0.0..=alpha).contains(&floor), "sac.temperature_floor", &floor, "from 0 to sac.initial_temperature")?;
+        check(
+            (0.0..=alpha).contains(&floor),
+            "sac.temperature_floor",
+            &floor,
+            "from 0 to sac.initial_temperature",
+        )?;
         let entropy = self.target_entropy.nats(1);
         check(entropy.is_finite(), "sac.target_entropy", &entropy, "a number of nats, or \"auto\"")?;
         let rate = self.updates_per_step;
@@ -244,13 +251,20 @@ pub struct CurriculumConfig {
     pub beta_start: f64,
     /// β never goes under it.
     pub beta_floor: f64,
+    /// β stays at `beta_start`: no evaluation promotes, and `best` is the one with the most falls that end standing.
+    pub fixed: bool,
+    /// Env steps without a better evaluation that end the training of a fixed β; 0 for no end.
+    pub patience: u64,
     /// β^{i+1} / β^i.
     pub decay: f64,
+    /// The same while β^i is over 1; β = 1 is never skipped.
+    pub decay_above_one: f64,
     /// Standard deviation of an episode's β̂ around β^i.
     pub beta_std: f64,
     /// An evaluation whose minimum return exceeds it passes the stage, ω.
     pub omega: f64,
-    /// In a stage with β over 1, an evaluation whose mean return exceeds it passes too; `inf` for none.
+    /// In a stage with β over 1, an evaluation whose mean return exceeds it passes too; no return exceeds the
+    /// default.
     pub omega_above_one: f64,
     /// Share of the episodes that begin high until the first promotion at a β of 1 or less: standing, collapsing.
     pub high_starts: f64,
@@ -267,10 +281,13 @@ impl Default for CurriculumConfig {
         Self {
             beta_start: 1.0,
             beta_floor: 0.4,
+            fixed: false,
+            patience: 0,
             decay: 0.95,
+            decay_above_one: 0.95,
             beta_std: 0.04,
             omega: 60.0,
-            omega_above_one: f64::INFINITY,
+            omega_above_one: 1e9,
             high_starts: 0.0,
             high_starts_fade: 0.1,
             n_min: 300_000,
@@ -287,9 +304,15 @@ impl CurriculumConfig {
         let start = self.beta_start;
         let good = start >= floor && start <= 4.0;
         check(good, "curriculum.beta_start", &start, "from curriculum.beta_floor to 4")?;
-        check(self.decay > 0.0 && self.decay < 1.0, "curriculum.decay", &self.decay, "between 0 and 1")?;
+        for (key, decay) in
+            [("curriculum.decay", self.decay), ("curriculum.decay_above_one", self.decay_above_one)]
+        {
+            check(decay > 0.0 && decay < 1.0, key, &decay, "between 0 and 1")?;
+        }
         check((0.0..=1.0).contains(&self.beta_std), "curriculum.beta_std", &self.beta_std, "from 0 to 1")?;
         check(self.omega.is_finite(), "curriculum.omega", &self.omega, "a number")?;
+        let above_one = self.omega_above_one;
+        check(above_one.is_finite(), "curriculum.omega_above_one", &above_one, "a number")?;
         for (key, share) in [
             ("curriculum.high_starts", self.high_starts),
             ("curriculum.high_starts_fade", self.high_starts_fade),

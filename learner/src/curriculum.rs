@@ -6,6 +6,9 @@
 //! evaluation past that without a pass ends the curriculum, with β of the last stage that passed.
 //!
 //! Evaluations must be given in the order of their versions. One of an earlier stage counts for nothing.
+//!
+//! With `fixed`, β stays: no evaluation promotes, the best one is kept (most falls that end standing, then the mean
+//! return), and training ends when none was better for `patience` env steps.
 
 use serde::{Deserialize, Serialize};
 
@@ -22,6 +25,8 @@ pub struct StageResult {
     pub min_return: f64,
     /// Their mean.
     pub mean_return: f64,
+    /// Share of them that end standing.
+    pub stand_rate: f64,
 }
 
 /// What follows from an evaluation.
@@ -31,6 +36,8 @@ pub enum Decision {
     Ignore,
     /// The stage goes on.
     Stay,
+    /// β is fixed, and no evaluation before was as good.
+    Better,
     /// The stage is passed and the next one begins.
     Promote {
         /// β of the stage that passed.
@@ -56,13 +63,18 @@ pub enum Outcome {
         /// β of the last stage that passed.
         beta: f64,
     },
+    /// A fixed β's evaluations no longer got better.
+    Settled {
+        /// That β.
+        beta: f64,
+    },
 }
 
 impl Outcome {
-    /// β of the last stage that passed, which is π_weak's.
+    /// β of the last stage that passed, which is π_weak's; or the fixed β.
     pub fn beta(self) -> f64 {
         match self {
-            Self::FloorPassed { beta } | Self::StageOutlasted { beta } => beta,
+            Self::FloorPassed { beta } | Self::StageOutlasted { beta } | Self::Settled { beta } => beta,
         }
     }
 }
@@ -79,14 +91,35 @@ pub struct Curriculum {
     stage_limit: Option<u64>,
     /// β of the last stage that passed.
     passed: Option<f64>,
+    /// Of a fixed β.
+    #[serde(default)]
+    best: Option<Best>,
     outcome: Option<Outcome>,
+}
+
+/// The best evaluation under a fixed β.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+struct Best {
+    stand_rate: f64,
+    mean_return: f64,
+    /// Env steps of the run when its version was made.
+    env_steps: u64,
 }
 
 impl Curriculum {
     /// Stage 0, at `beta_start`.
     pub fn new(config: CurriculumConfig) -> Self {
         let beta = config.beta_start;
-        Self { config, stage: 0, beta, stage_start: 0, stage_limit: None, passed: None, outcome: None }
+        Self {
+            config,
+            stage: 0,
+            beta,
+            stage_start: 0,
+            stage_limit: None,
+            passed: None,
+            best: None,
+            outcome: None,
+        }
     }
 
     /// The same state under other settings: a resumed run may change them.
@@ -116,9 +149,9 @@ impl Curriculum {
 
     /// Share of the episodes that begin high in this stage.
     pub fn high_starts(&self) -> f64 {
-        let CurriculumConfig { beta_start, decay, high_starts, high_starts_fade, .. } = self.config;
+        let CurriculumConfig { beta_start, decay_above_one, high_starts, high_starts_fade, .. } = self.config;
         // Promotions that lead from `beta_start` down to 1.
-        let above = if beta_start > 1.0 { (-beta_start.ln() / decay.ln()).ceil() } else { 0.0 };
+        let above = if beta_start > 1.0 { (-beta_start.ln() / decay_above_one.ln()).ceil() } else { 0.0 };
         let promotions = (f64::from(self.stage) - above).max(0.0);
         (high_starts - high_starts_fade * promotions).max(0.0)
     }
@@ -139,6 +172,9 @@ impl Curriculum {
         if self.outcome.is_some() || result.stage != self.stage {
             return Decision::Ignore;
         }
+        if self.config.fixed {
+            return self.hold(result);
+        }
         let steps = self.stage_steps(result.env_steps);
         let early = self.beta > 1.0 && result.mean_return > self.config.omega_above_one;
         if early || result.min_return > self.config.omega {
@@ -150,6 +186,21 @@ impl Curriculum {
         } else {
             Decision::Stay
         }
+    }
+
+    /// Keeps the best of a fixed β's evaluations.
+    fn hold(&mut self, StageResult { stand_rate, mean_return, env_steps, .. }: StageResult) -> Decision {
+        let Some(best) =
+            self.best.filter(|best| (stand_rate, mean_return) <= (best.stand_rate, best.mean_return))
+        else {
+            self.best = Some(Best { stand_rate, mean_return, env_steps });
+            return Decision::Better;
+        };
+        let patience = self.config.patience;
+        if patience > 0 && env_steps.saturating_sub(best.env_steps) >= patience {
+            return self.finish(Outcome::Settled { beta: self.beta });
+        }
+        Decision::Stay
     }
 
     fn pass(&mut self, steps: u64, now: u64) -> Decision {
@@ -167,8 +218,10 @@ impl Curriculum {
     }
 
     fn next_beta(&self) -> f64 {
-        let next = (self.beta * self.config.decay).max(self.config.beta_floor);
-        if self.beta > 1.0 { next.max(1.0) } else { next }
+        if self.beta > 1.0 {
+            return (self.beta * self.config.decay_above_one).max(1.0);
+        }
+        (self.beta * self.config.decay).max(self.config.beta_floor)
     }
 
     fn finish(&mut self, outcome: Outcome) -> Decision {
@@ -187,7 +240,7 @@ mod tests {
     }
 
     fn result(stage: u32, env_steps: u64, min_return: f64) -> StageResult {
-        StageResult { stage, env_steps, min_return, mean_return: min_return }
+        StageResult { stage, env_steps, min_return, mean_return: min_return, stand_rate: 0.0 }
     }
 
     #[test]
@@ -257,8 +310,12 @@ mod tests {
 
     #[test]
     fn from_above_one_a_stage_at_exactly_one_exists() {
-        let mut curriculum =
-            Curriculum::new(CurriculumConfig { beta_start: 1.6, decay: 0.7, ..CurriculumConfig::default() });
+        let mut curriculum = Curriculum::new(CurriculumConfig {
+            beta_start: 1.6,
+            decay: 0.7,
+            decay_above_one: 0.7,
+            ..CurriculumConfig::default()
+        });
         let mut betas = vec![curriculum.beta()];
         while curriculum.outcome().is_none() {
             curriculum.report(result(curriculum.stage(), 0, 61.0), 0);
@@ -267,6 +324,71 @@ mod tests {
         let rounded: Vec<f64> = betas.iter().map(|beta| (beta * 1e4).round() / 1e4).collect();
         assert_eq!(rounded, [1.6, 1.12, 1.0, 0.7, 0.49, 0.4, 0.4]);
         assert_eq!(curriculum.outcome(), Some(Outcome::FloorPassed { beta: 0.4 }));
+    }
+
+    #[test]
+    fn above_one_a_mean_over_its_own_threshold_passes_and_at_one_it_does_not() {
+        let mut curriculum = Curriculum::new(CurriculumConfig {
+            beta_start: 1.05,
+            decay_above_one: 0.9,
+            omega_above_one: 35.0,
+            ..CurriculumConfig::default()
+        });
+        let result = |stage, mean_return| StageResult {
+            stage,
+            env_steps: 0,
+            min_return: 0.0,
+            mean_return,
+            stand_rate: 0.0,
+        };
+        assert_eq!(curriculum.report(result(0, 35.0), 0), Decision::Stay);
+        assert_eq!(curriculum.report(result(0, 35.1), 0), Decision::Promote { passed: 1.05, next: 1.0 });
+        assert_eq!(curriculum.report(result(1, 59.0), 0), Decision::Stay);
+    }
+
+    #[test]
+    fn a_fixed_beta_keeps_its_best_evaluation_and_ends_when_none_was_better_for_long() {
+        let mut curriculum = Curriculum::new(CurriculumConfig {
+            fixed: true,
+            patience: 30_000,
+            ..CurriculumConfig::default()
+        });
+        let mut report = |env_steps, stand_rate, mean_return| {
+            curriculum.report(
+                StageResult { stage: 0, env_steps, min_return: 70.0, mean_return, stand_rate },
+                env_steps,
+            )
+        };
+        assert_eq!(report(0, 0.0, 5.0), Decision::Better);
+        assert_eq!(report(10_000, 0.0, 9.0), Decision::Better);
+        assert_eq!(report(20_000, 0.5, 7.0), Decision::Better, "standing counts before the return");
+        assert_eq!(report(30_000, 0.5, 7.0), Decision::Stay);
+        assert_eq!(report(40_000, 0.4, 90.0), Decision::Stay);
+        assert_eq!(report(50_000, 0.4, 90.0), Decision::Finish(Outcome::Settled { beta: 1.0 }));
+        assert_eq!(report(60_000, 1.0, 90.0), Decision::Ignore);
+        assert_eq!((curriculum.beta(), curriculum.stage()), (1.0, 0));
+    }
+
+    #[test]
+    fn high_starts_fade_with_the_promotions_from_one_on() {
+        let config = CurriculumConfig {
+            beta_start: 1.6,
+            decay_above_one: 0.9,
+            high_starts: 0.25,
+            ..CurriculumConfig::default()
+        };
+        let mut curriculum = Curriculum::new(config);
+        let mut shares = Vec::new();
+        while curriculum.beta() > 0.8 {
+            shares.push((curriculum.beta() > 1.0, (curriculum.high_starts() * 100.0).round()));
+            curriculum.report(result(curriculum.stage(), 0, 61.0), 0);
+        }
+        let at_one = shares.iter().position(|(above, _)| !above).unwrap();
+        assert!(shares[..=at_one].iter().all(|(_, share)| *share == 25.0), "{shares:?}");
+        assert_eq!(
+            shares[at_one + 1..].iter().map(|(_, share)| *share).collect::<Vec<_>>(),
+            [15.0, 5.0, 0.0, 0.0]
+        );
     }
 
     proptest! {

@@ -107,8 +107,7 @@ impl Sac {
         let products = config.precision.kind(device);
         let policy = Policy::init(config.policy_shape(shape.observation, shape.action), &mut rng);
         let inputs = shape.observation + shape.action;
-        let critics =
-            Critics::new(config.critics, config.critic_body(), inputs, &mut rng, products, device);
+        let critics = Critics::new(config.critics, config.critic_body(), inputs, &mut rng, products, device);
         let actor = Actor::new(&policy, products, device);
         Self {
             target_entropy: config.target_entropy.nats(shape.action),

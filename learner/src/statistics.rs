@@ -32,13 +32,21 @@ impl RunningStatistics {
             return;
         }
         let total = self.count + added;
-        for column in 0..width {
-            let values = || rows.iter().skip(column).step_by(width).map(|value| f64::from(*value));
-            let mean = values().sum::<f64>() / added;
-            let squares = values().map(|value| (value - mean).powi(2)).sum::<f64>();
-            let shift = mean - self.mean[column];
-            self.squares[column] += squares + shift * shift * self.count * added / total;
-            self.mean[column] += shift * added / total;
+        // Row by row: columns would be read with a stride.
+        let mut means = vec![0.0; width];
+        for row in rows.chunks_exact(width) {
+            means.iter_mut().zip(row).for_each(|(mean, value)| *mean += f64::from(*value));
+        }
+        means.iter_mut().for_each(|mean| *mean /= added);
+        for row in rows.chunks_exact(width) {
+            for ((squares, mean), value) in self.squares.iter_mut().zip(&means).zip(row) {
+                *squares += (f64::from(*value) - mean).powi(2);
+            }
+        }
+        for ((squares, old), mean) in self.squares.iter_mut().zip(&mut self.mean).zip(&means) {
+            let shift = mean - *old;
+            *squares += shift * shift * self.count * added / total;
+            *old += shift * added / total;
         }
         self.count = total;
     }

@@ -5,6 +5,7 @@
 //! [`MinibatchSource`]; the deterministic mode of `getup train` feeds it step by step. Nothing here knows whether
 //! replay and actors are in the same process.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -96,6 +97,18 @@ pub enum Ending {
     Shutdown,
 }
 
+/// What training starts from.
+#[derive(Clone, Copy, Debug)]
+pub enum Start<'a> {
+    /// Networks drawn from the seed.
+    Untrained,
+    /// The networks of another run's checkpoint, with all that their updates need. Curriculum and env steps begin
+    /// anew.
+    Checkpoint(&'a Path),
+    /// Where the run's newest checkpoint stands, if it has one.
+    Newest,
+}
+
 /// The state of a training run.
 pub struct Trainer {
     config: TrainerConfig,
@@ -115,24 +128,31 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Training from the newest checkpoint of `folder` where `resume`, else from untrained networks; publishes its
-    /// policy at once and, on a new run, offers it for evaluation.
+    /// Training from `start`; publishes its policy at once and, on a new run, offers it for evaluation.
     pub fn new(
         config: TrainerConfig,
         folder: RunFolder,
         hub: Arc<Hub>,
         incarnation: u64,
-        resume: bool,
+        start: Start<'_>,
         device: tch::Device,
         registry: &Registry,
     ) -> Result<Self, TrainError> {
         folder.create()?;
-        let mut sac = Sac::new(&config.shape, &config.sac, config.seed, device, config.learner.effective_threads());
+        let mut sac =
+            Sac::new(&config.shape, &config.sac, config.seed, device, config.learner.effective_threads());
         let mut curriculum = Curriculum::new(config.curriculum.clone());
         let mut progress = Progress { next_evaluation: config.evaluation.every, ..Progress::default() };
-        let checkpoint = if resume { Checkpoint::newest(&folder.checkpoints())? } else { None };
-        let resumed = checkpoint.is_some();
-        if let Some(checkpoint) = checkpoint {
+        let resumed = match start {
+            Start::Untrained => None,
+            Start::Checkpoint(path) => {
+                Checkpoint::load(path)?.restore(&mut sac)?;
+                None
+            }
+            Start::Newest => Checkpoint::newest(&folder.checkpoints())?,
+        };
+        let is_resumed = resumed.is_some();
+        if let Some(checkpoint) = resumed {
             checkpoint.restore(&mut sac)?;
             curriculum = checkpoint.curriculum.with_config(config.curriculum.clone());
             progress = checkpoint.progress;
@@ -158,7 +178,7 @@ impl Trainer {
             trainer.publish_final()?;
         } else {
             let policy = trainer.publish();
-            if !resumed || trainer.progress.evaluation_owed {
+            if !is_resumed || trainer.progress.evaluation_owed {
                 trainer.offer(policy);
             }
         }

@@ -78,7 +78,8 @@ impl GetUp {
         let [right_hand, right_foot] = [world.body("right_hand")?, world.body("right_foot")?];
         let fall =
             Fall { height: DROP_HEIGHT, limp_steps: config.ragdoll_steps, limp_std: config.ragdoll_std };
-        let angle = |name: String| STANDING_POSE.iter().find(|(hinge, _)| *hinge == name).map_or(0.0, |pose| pose.1);
+        let angle =
+            |name: String| STANDING_POSE.iter().find(|(hinge, _)| *hinge == name).map_or(0.0, |pose| pose.1);
         let standing = Standing {
             hinges: world.hinge_names().into_iter().map(angle).collect(),
             hinge_std: 0.1,

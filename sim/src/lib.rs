@@ -8,6 +8,7 @@
 //! * [`Task`] and [`GetUp`]: what is observed, what is paid, how episodes begin ([`Resets`]) and end.
 //! * [`Lane`]: one world playing episodes of one task.
 //! * [`falls`] and [`rollout`]: the files behind `getup falls` and `getup rollout`.
+//! * `picture`, with the feature `render`: what `getup render` draws.
 //!
 //! ```
 //! use std::sync::Arc;
@@ -32,6 +33,8 @@ mod error;
 pub mod falls;
 mod getup;
 mod lane;
+#[cfg(feature = "render")]
+pub mod picture;
 mod reset;
 pub mod rollout;
 mod rollout_json;

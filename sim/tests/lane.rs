@@ -269,3 +269,49 @@ proptest! {
         prop_assert_eq!(lane.terms().iter().product::<f64>(), lane.reward());
     }
 }
+
+#[test]
+fn a_high_start_stands_on_the_floor_and_is_limp_in_part_of_the_cases() {
+    for character in [Character::Standard, Character::Cast, Character::OneArm] {
+        let mut lane = lane(&TaskConfig { character, ..TaskConfig::default() });
+        let (mut limp, mut heads, mut headings) = (0, Vec::new(), Vec::new());
+        for seed in 0..300 {
+            lane.begin_standing(seed, 0.9);
+            limp += usize::from(lane.phase() == Phase::Limp);
+            heads.push(lane.world().head_height());
+            let qpos = lane.world().qpos();
+            headings.push(2.0 * qpos[6].atan2(qpos[3]));
+            let ranges = lane.world().hinge_ranges().iter().zip(&qpos[7..]);
+            assert!(ranges.into_iter().all(|([lower, upper], angle)| lower <= angle && angle <= upper));
+            let (qpos, qvel) = (qpos.to_vec(), lane.world().qvel().to_vec());
+            assert!(qvel.iter().all(|velocity| *velocity == 0.0));
+            let mut world = lane.world().clone();
+            assert!(world.lowest_point_at(&qpos).abs() < 1e-9);
+        }
+        heads.sort_by(f64::total_cmp);
+        assert!(heads[0] > 1.35 && heads[299] < 1.7, "{} to {}", heads[0], heads[299]);
+        // 60 % are limp at first, but one in sixty of those for no step at all.
+        assert!((140..215).contains(&limp), "{limp} of 300");
+        assert!(
+            headings.iter().any(|heading| heading.sin() > 0.9) && headings.iter().any(|h| h.sin() < -0.9)
+        );
+    }
+}
+
+#[test]
+fn a_high_start_depends_on_its_seed_alone_and_ends_its_limp_steps_like_a_fall() {
+    let (mut used, mut fresh) = (standard(), standard());
+    used.begin(3, 1.0);
+    fall(&mut used);
+    for seed in 0..20 {
+        used.begin_standing(seed, 0.8);
+        fresh.begin_standing(seed, 0.8);
+        let steps = fall(&mut used);
+        assert_eq!(steps, fall(&mut fresh));
+        assert!(steps.len() <= 59 && steps.last().is_none_or(|step| step.landed));
+        assert_eq!(used.observation(), fresh.observation());
+        for step in 1..=250 {
+            assert_eq!(used.step(&action(step)).unwrap().truncated, step == 250);
+        }
+    }
+}

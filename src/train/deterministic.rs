@@ -16,7 +16,7 @@ use getup_actor::metrics::ActorMetrics;
 use getup_learner::device;
 use getup_learner::hub::Hub;
 use getup_learner::run_folder::RunFolder;
-use getup_learner::trainer::{Ending, Trainer};
+use getup_learner::trainer::{Ending, Start, Trainer};
 use getup_proto::v1;
 use getup_replay::{SampleOptions, Sampler, Store};
 use getup_sim::GetUp;
@@ -28,12 +28,12 @@ use crate::config::Config;
 use crate::learner::{make_hub, make_trainer, sample_options};
 use crate::role::Role;
 
-pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, resume: bool) -> Result<Ending> {
+pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_>) -> Result<Ending> {
     let device = device::open(config.learner.device, 1)?;
     folder.create()?;
     let store = open_store(config, role, folder)?;
     let (hub, incarnation) = make_hub(config, role, folder)?;
-    let trainer = make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, resume)?;
+    let trainer = make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, start)?;
     note_config(config, folder)?;
     let bar = Progress::start(role, config, Arc::clone(&hub));
     // The writer's id is part of every random draw of the lanes: here it is the number of the start.

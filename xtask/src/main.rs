@@ -1,15 +1,17 @@
-//! Set-up, training, tests, checks and benchmarks of getup, with one command each.
+//! Set-up, training, tests, checks, benchmarks and figures of getup, with one command each.
 //!
 //! `xtask` builds without MuJoCo or libtorch, so that it can be the program that brings them.
 
+mod ablate;
 mod native;
+mod plot;
 mod prerequisites;
 mod tasks;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 
-/// Set up, train, test, check and measure getup.
+/// Set up, train, test, check, measure and show getup.
 #[derive(Parser)]
 #[command(bin_name = "cargo xtask")]
 struct Cli {
@@ -47,6 +49,23 @@ enum Command {
         /// The benchmark; a file of this name lies in `benches/`.
         name: String,
     },
+    /// Train what the paper's Fig. 3a compares: the curriculum and fixed torque limits.
+    ///
+    /// The runs are curriculum, fixed-100, fixed-60, fixed-50 and fixed-40 (per cent of the character's own torques),
+    /// each for every seed, with preset laptop, one after another. They lie in runs/ablation/; what the figures read of
+    /// a run is copied to docs/runs/ablation/ when it is done.
+    ///
+    /// Ctrl-C saves and ends; the same command again goes on, and skips what is done.
+    Ablate(ablate::Args),
+    /// Draw the figures in `docs/` from the runs in `docs/runs/`.
+    ///
+    /// To show a run, copy its config.toml, evaluations.jsonl and timings.jsonl to docs/runs/NAME-SEED/, such as
+    /// docs/runs/laptop-1/. They become docs/learning-curve.png and docs/torque-limit.png; a run in docs/runs/standing/
+    /// becomes docs/standing.png, and the runs of `cargo xtask ablate` docs/ablation.png. A figure without a run is
+    /// left out, and said to be. The first time installs matplotlib into .native/plots/.
+    Plot,
+    /// Print a Markdown table of the runs in `docs/runs/`: env steps and minutes to each mark.
+    Runs,
 }
 
 fn main() -> Result<()> {
@@ -77,5 +96,11 @@ fn main() -> Result<()> {
             native::set_up(false)?;
             tasks::bench(&name)
         }
+        Command::Ablate(args) => {
+            native::set_up(false)?;
+            ablate::ablate(&args)
+        }
+        Command::Plot => plot::figures(),
+        Command::Runs => plot::table(),
     }
 }

@@ -35,6 +35,8 @@ const CUDA_WHEELS: &[&str] = &[
 ];
 /// What benchmarks compare with: PyTorch whole, with NumPy for its tensors.
 const PEER_REQUIREMENTS: &[&str] = &["torch==2.11.0", "numpy==2.3.5"];
+/// What `docs/curves.py` draws with; tomli reads TOML where Python does not yet.
+const PLOT_REQUIREMENTS: &[&str] = &["matplotlib==3.10.9", "tomli==2.5.0; python_version < '3.11'"];
 
 /// The variables that tell build scripts where the libraries are, and the folder of each in `.native`.
 pub(crate) const BUILD_VARIABLES: [(&str, &str); 2] =
@@ -52,6 +54,11 @@ fn native() -> PathBuf {
 /// The Python of the peers' environment.
 pub(crate) fn peers_python() -> PathBuf {
     native().join("peers/bin/python")
+}
+
+/// The Python of the plots' environment.
+pub(crate) fn plots_python() -> PathBuf {
+    native().join("plots/bin/python")
 }
 
 /// Installs the wheels and writes `.cargo/native.toml`, where they are missing or of other versions. Without `cuda`
@@ -72,16 +79,29 @@ pub(crate) fn set_up(cuda: bool) -> Result<()> {
 
 /// Makes the environment that the benchmarks' peers run in.
 pub(crate) fn set_up_peers() -> Result<()> {
-    let folder = native().join("peers");
+    set_up_environment("peers", &peers_python(), PEER_REQUIREMENTS, "the benchmarks' peers")
+}
+
+/// Makes the environment that figures are drawn in.
+pub(crate) fn set_up_plots() -> Result<()> {
+    prerequisites::check()?;
+    set_up_environment("plots", &plots_python(), PLOT_REQUIREMENTS, "matplotlib for the figures (200 MB)")
+}
+
+/// Makes a Python environment in `.native/NAME`, where it is missing or of other requirements.
+fn set_up_environment(name: &str, python: &Path, requirements: &[&str], what: &str) -> Result<()> {
+    let folder = native().join(name);
     let stamp = folder.join("installed");
-    let wanted = PEER_REQUIREMENTS.join("\n");
+    let wanted = requirements.join("\n");
     if fs::read_to_string(&stamp).is_ok_and(|installed| installed == wanted) {
         return Ok(());
     }
-    println!("Installing the benchmarks' peers into {}", folder.display());
+    // Standard output belongs to what the environment is made for, such as a table.
+    eprintln!("Installing {what} into {}", folder.display());
     run(Command::new("python3").args(["-m", "venv"]).arg(&folder))?;
-    run(Command::new(peers_python()).args(["-m", "pip", "install", "--quiet"]).args(PEER_REQUIREMENTS))?;
-    fs::write(stamp, wanted).context("cannot note the peers' versions")
+    let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"];
+    run(Command::new(python).args(pip).args(requirements))?;
+    fs::write(&stamp, wanted).with_context(|| format!("cannot note the versions in {}", stamp.display()))
 }
 
 /// Installs wheels without their dependencies, all or none.

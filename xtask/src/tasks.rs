@@ -1,5 +1,6 @@
 //! Train, test, check, bench: each a few cargo commands, all on the release profile, so that they share artefacts.
 
+use std::path::PathBuf;
 use std::process::Command;
 
 use anyhow::{Context, Result, bail};
@@ -16,10 +17,15 @@ fn cargo() -> Command {
     command
 }
 
+/// Builds getup; returns where it lies.
+pub(crate) fn build() -> Result<PathBuf> {
+    run(cargo().args(["build", "--release", "--package", "getup"]))?;
+    Ok(root().join("target/release/getup"))
+}
+
 /// Builds and becomes `getup train`: its exit code, its signals, its terminal.
 pub(crate) fn train(arguments: &[String]) -> Result<()> {
-    run(cargo().args(["build", "--release", "--package", "getup"]))?;
-    let mut command = Command::new(root().join("target/release/getup"));
+    let mut command = Command::new(build()?);
     command.arg("train").args(arguments);
     #[cfg(unix)]
     {

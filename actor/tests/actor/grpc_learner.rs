@@ -91,7 +91,13 @@ async fn a_heartbeat_brings_a_lease_to_an_idle_actor_and_a_report_is_accepted_or
     let beat = broadcast.with(|state| state.heartbeats[0].clone());
     assert_eq!((beat.actor.as_str(), beat.lease, beat.idle, beat.env_steps), ("actor-1", 4, false, 9));
 
-    let result = EpisodeResult { episode_return: 4.6, max_head_height: 0.3, final_head_height: 0.1 };
+    let result = EpisodeResult {
+        episode_return: 4.6,
+        max_head_height: 0.3,
+        final_head_height: 0.1,
+        rises: true,
+        stands: false,
+    };
     assert_eq!(link.report(5, vec![result; 2]).await, Ok(Reported::Accepted));
     let report = broadcast.with(|state| state.reports[0].clone());
     assert_eq!((report.lease, report.actor.as_str(), report.episodes.len()), (5, "actor-1", 2));

@@ -29,31 +29,89 @@ fn bf16(value: f32) -> u32 {
     (bits.wrapping_add(0x7fff + ((bits >> 16) & 1))) >> 16
 }
 
-/// Rounds rows to bfloat16: as they are (`plain`), and two rows interleaved (`pairs`). An odd last row pairs with
-/// zeros.
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+/// Rounds rows to bfloat16: as they are (`plain`), and two rows interleaved (`pairs`, where there is room). An odd
+/// last row pairs with zeros.
 pub(super) fn pack_bf16(values: &[f32], layout: Layout, plain: &mut [u16], pairs: &mut [u32]) {
     let Layout { length, stride } = layout;
-    let two_rows = values.chunks(2 * length).zip(plain.chunks_mut(2 * stride));
-    for ((from, plain), pairs) in two_rows.zip(pairs.chunks_exact_mut(length)) {
+    #[cfg(target_arch = "x86_64")]
+    let native = is_x86_feature_detected!("avx512bf16") && is_x86_feature_detected!("avx512vl");
+    let mut pairs = pairs.chunks_exact_mut(length);
+    for (from, plain) in values.chunks(2 * length).zip(plain.chunks_mut(2 * stride)) {
         let (even, odd) = from.split_at(length);
         let (plain_even, plain_odd) = plain.split_at_mut(stride);
         let plain_even = &mut plain_even[..length];
-        if odd.is_empty() {
-            for ((value, plain), pair) in even.iter().zip(plain_even).zip(pairs) {
-                *pair = bf16(*value);
-                *plain = *pair as u16;
+        let rows = match (odd.is_empty(), pairs.next()) {
+            (false, Some(pairs)) => [(even, odd, plain_even, &mut plain_odd[..length], pairs)],
+            (true, Some(pairs)) => {
+                round_row(even, plain_even);
+                plain_even.iter().zip(pairs).for_each(|(plain, pair)| *pair = u32::from(*plain));
+                continue;
             }
+            (lone, None) => {
+                round_row(even, plain_even);
+                if !lone {
+                    round_row(odd, &mut plain_odd[..length]);
+                }
+                continue;
+            }
+        };
+        let [(even, odd, plain_even, plain_odd, pairs)] = rows;
+        #[cfg(target_arch = "x86_64")]
+        if native {
+            // SAFETY: the processor has AVX512-BF16 and AVX512-VL, and with them AVX-512 F; all five have `length`.
+            unsafe { pack_rows_avx512(even, odd, plain_even, plain_odd, pairs) };
             continue;
         }
-        let (odd, plain_odd, pairs) = (&odd[..length], &mut plain_odd[..length], &mut pairs[..length]);
-        for i in 0..length {
-            let (low, high) = (bf16(even[i]), bf16(odd[i]));
-            plain_even[i] = low as u16;
-            plain_odd[i] = high as u16;
-            pairs[i] = low | (high << 16);
+        pack_rows(even, odd, plain_even, plain_odd, pairs);
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+fn round_row(values: &[f32], plain: &mut [u16]) {
+    plain.iter_mut().zip(values).for_each(|(plain, value)| *plain = bf16(*value) as u16);
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+fn pack_rows(even: &[f32], odd: &[f32], plain_even: &mut [u16], plain_odd: &mut [u16], pairs: &mut [u32]) {
+    let rows = even.iter().zip(odd).zip(plain_even).zip(plain_odd).zip(pairs);
+    for ((((even, odd), plain_even), plain_odd), pair) in rows {
+        let (low, high) = (bf16(*even), bf16(*odd));
+        *plain_even = low as u16;
+        *plain_odd = high as u16;
+        *pair = low | (high << 16);
+    }
+}
+
+/// # Safety
+/// The processor has AVX-512 F and VL and AVX512-BF16; all five slices have the length of the first.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512vl,avx512bf16")]
+unsafe fn pack_rows_avx512(
+    even: &[f32],
+    odd: &[f32],
+    plain_even: &mut [u16],
+    plain_odd: &mut [u16],
+    pairs: &mut [u32],
+) {
+    use std::arch::x86_64::*;
+    let whole = even.len() - even.len() % LANES;
+    for i in (0..whole).step_by(LANES) {
+        // SAFETY: as the caller promises, 16 numbers from i on are in every slice; the two vectors of bfloat16 are 32
+        // bytes either way.
+        unsafe {
+            let round = |values: &[f32]| -> __m256i {
+                std::mem::transmute(_mm512_cvtneps_pbh(_mm512_loadu_ps(values.as_ptr().add(i))))
+            };
+            let (low, high) = (round(even), round(odd));
+            _mm256_storeu_si256(plain_even.as_mut_ptr().add(i).cast(), low);
+            _mm256_storeu_si256(plain_odd.as_mut_ptr().add(i).cast(), high);
+            let high = _mm512_slli_epi32::<16>(_mm512_cvtepu16_epi32(high));
+            let pair = _mm512_or_si512(_mm512_cvtepu16_epi32(low), high);
+            _mm512_storeu_si512(pairs.as_mut_ptr().add(i).cast(), pair);
         }
     }
+    let (plain_even, plain_odd) = (&mut plain_even[whole..], &mut plain_odd[whole..]);
+    pack_rows(&even[whole..], &odd[whole..], plain_even, plain_odd, &mut pairs[whole..]);
 }
 
 /// Turns `[rows, columns]` words into `[columns, rows]`, by blocks that fit into registers.
@@ -373,7 +431,13 @@ pub(crate) struct AdamStep {
 
 /// One step of AdamW (Loshchilov & Hutter 2019) on a run of parameters.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-pub(super) fn adam(step: AdamStep, values: &mut [f32], gradient: &[f32], first: &mut [f32], second: &mut [f32]) {
+pub(super) fn adam(
+    step: AdamStep,
+    values: &mut [f32],
+    gradient: &[f32],
+    first: &mut [f32],
+    second: &mut [f32],
+) {
     let length = values.len();
     let (gradient, first, second) = (&gradient[..length], &mut first[..length], &mut second[..length]);
     for i in 0..length {

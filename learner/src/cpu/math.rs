@@ -78,7 +78,8 @@ mod tests {
         for i in -400_000..=400_000 {
             let x = i as f32 * 2e-4;
             let exact = f64::from(x);
-            let relative = |ours: f32, theirs: f64| ((f64::from(ours) - theirs) / theirs.abs().max(1e-30)).abs();
+            let relative =
+                |ours: f32, theirs: f64| ((f64::from(ours) - theirs) / theirs.abs().max(1e-30)).abs();
             assert!(relative(exp(x), exact.exp()) < 3e-7, "exp {x}: {}", exp(x));
             assert!(relative(tanh(x), exact.tanh()) < 3e-7 || x == 0.0, "tanh {x}: {}", tanh(x));
             let wanted = exact.max(0.0) + (-exact.abs()).exp().ln_1p();

@@ -13,7 +13,6 @@ mod network;
 mod product;
 mod update;
 
-
 #[cfg(test)]
 mod tests;
 

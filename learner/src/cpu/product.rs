@@ -163,8 +163,7 @@ impl Operand {
 
     /// Brings the columns up to date with the plain layout: for the gradient of the weights that read this.
     pub(super) fn transpose(&mut self) {
-        let (features, words) =
-            (self.format.padded(self.features), self.rows / self.format.per_word());
+        let (features, words) = (self.format.padded(self.features), self.rows / self.format.per_word());
         kernels::transpose(&self.plain, features, words, &mut self.columns);
     }
 
@@ -174,13 +173,15 @@ impl Operand {
     }
 }
 
-/// Rounds a matrix into the plain layout (rows of `layout.stride` numbers) and into pairs.
+/// Rounds a matrix into the plain layout (rows of `layout.stride` numbers) and, where there is room, into pairs.
 fn pack(format: Format, values: &[f32], layout: kernels::Layout, plain: &mut [u32], pairs: &mut [u32]) {
     match format {
         Format::F32 => {
             let words = bytemuck::cast_slice(values);
             plain[..words.len()].copy_from_slice(words);
-            pairs[..words.len()].copy_from_slice(words);
+            if !pairs.is_empty() {
+                pairs[..words.len()].copy_from_slice(words);
+            }
         }
         Format::Bf16 => kernels::pack_bf16(values, layout, bytemuck::cast_slice_mut(plain), pairs),
     }
@@ -209,7 +210,7 @@ impl Weights {
             outputs,
             plain: zeros(outputs.next_multiple_of(2) * format.padded(inputs) / per_word),
             transposed: zeros(turned),
-            pairs: zeros(format.padded(outputs) / per_word * inputs),
+            pairs: zeros(if differentiated { format.padded(outputs) / per_word * inputs } else { 0 }),
         }
     }
 
@@ -227,13 +228,18 @@ impl Weights {
     pub(super) fn apply(&self, x: &Operand, accumulate: bool, to: &mut [f32]) {
         let k = self.format.padded(self.inputs);
         let size = Size { m: self.outputs, n: x.rows, k };
-        let product =
-            Product { format: self.format, size, lda: k, ldb: x.rows, ldc: x.rows, accumulate };
+        let product = Product { format: self.format, size, lda: k, ldb: x.rows, ldc: x.rows, accumulate };
         product.run(&self.plain, &x.pairs, to);
     }
 
     /// `to = Wᵀ·gradient`, for the inputs from `first` on: `[inputs − first, R]`.
-    pub(super) fn apply_transposed(&self, gradient: &Operand, first: usize, accumulate: bool, to: &mut [f32]) {
+    pub(super) fn apply_transposed(
+        &self,
+        gradient: &Operand,
+        first: usize,
+        accumulate: bool,
+        to: &mut [f32],
+    ) {
         let k = self.format.padded(self.outputs);
         let (m, n) = (self.inputs - first, gradient.rows);
         let product =

@@ -137,7 +137,8 @@ fn a_product_in_bfloat16_is_that_of_the_rounded_numbers() {
     let mut rng = ChaCha8Rng::seed_from_u64(3);
     let (m, n, k) = (5, 16, 7);
     let (a, b) = (random(m * k, -1.0, 1.0, &mut rng), random(k * n, -1.0, 1.0, &mut rng));
-    let round = |value: f32| f32::from_bits((value.to_bits() + 0x7fff + ((value.to_bits() >> 16) & 1)) & 0xffff_0000);
+    let round =
+        |value: f32| f32::from_bits((value.to_bits() + 0x7fff + ((value.to_bits() >> 16) & 1)) & 0xffff_0000);
     let mut right = Operand::new(Format::Bf16, k, n);
     right.pack(&b);
     let mut left = vec![0u32; m * 4];
@@ -147,7 +148,14 @@ fn a_product_in_bfloat16_is_that_of_the_rounded_numbers() {
         }
     }
     let mut result = vec![0.0; m * n];
-    let product = Product { format: Format::Bf16, size: Size { m, n, k: 8 }, lda: 8, ldb: n, ldc: n, accumulate: false };
+    let product = Product {
+        format: Format::Bf16,
+        size: Size { m, n, k: 8 },
+        lda: 8,
+        ldb: n,
+        ldc: n,
+        accumulate: false,
+    };
     product.run(&left, &right.pairs, &mut result);
     for row in 0..m {
         for column in 0..n {

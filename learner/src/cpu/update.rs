@@ -292,6 +292,8 @@ struct Worker {
     beta: Aligned<f32>,
     log_prob: Aligned<f32>,
     value: Aligned<f32>,
+    /// Transitions whose smallest Q a critic has answered for.
+    taken: Vec<bool>,
     share: Aligned<f32>,
     /// `[action, R]`: the gradient of the actor's loss by the actions, as far as it goes through the critics.
     action_gradient: Aligned<f32>,
@@ -316,6 +318,7 @@ impl Worker {
             beta: zeros(padded),
             log_prob: zeros(padded),
             value: zeros(padded),
+            taken: vec![false; rows.len()],
             share: zeros(padded),
             action_gradient: zeros(action * padded),
             staging: zeros(critic.inputs * padded),
@@ -398,10 +401,10 @@ impl Worker {
 
         let scale = 1.0 / inputs.batch.rows() as f32;
         self.action_gradient.fill(0.0);
-        let mut taken = vec![false; rows.len()];
+        self.taken.fill(false);
         for ((values, weights), trace) in critics().zip(&mut self.critics) {
             trace.output_gradients[0].fill(0.0);
-            for (row, taken) in taken.iter_mut().enumerate() {
+            for (row, taken) in self.taken.iter_mut().enumerate() {
                 // The first critic that gives the minimum answers for it.
                 if !*taken && trace.outputs[0][row] == self.value[row] {
                     trace.output_gradients[0][row] = -scale;
@@ -437,7 +440,12 @@ impl Worker {
     }
 }
 
-fn motor<'a>(outputs: &'a [Aligned<f32>], noise: &'a [f32], beta: &'a [f32], part: Range<usize>) -> Motor<'a> {
+fn motor<'a>(
+    outputs: &'a [Aligned<f32>],
+    noise: &'a [f32],
+    beta: &'a [f32],
+    part: Range<usize>,
+) -> Motor<'a> {
     Motor {
         mean: &outputs[0][part.clone()],
         raw_log_std: &outputs[1][part.clone()],

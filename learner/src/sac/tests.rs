@@ -147,8 +147,11 @@ fn a_toy_task_is_learned_to_its_known_optimum_normalised_or_not_and_in_both_prec
 #[test]
 fn the_actors_forward_pass_agrees_with_the_learners_network_on_every_shape() {
     let mlp = |hidden: &[usize]| SacConfig { hidden: hidden.to_vec(), ..SacConfig::default() };
-    let simba = |actor_width, actor_blocks| {
-        SacConfig { network: NetworkKind::Simba, actor_width, actor_blocks, ..SacConfig::default() }
+    let simba = |actor_width, actor_blocks| SacConfig {
+        network: NetworkKind::Simba,
+        actor_width,
+        actor_blocks,
+        ..SacConfig::default()
     };
     for (config, observation, action) in [
         (mlp(&[1024, 1024]), 68, 21),

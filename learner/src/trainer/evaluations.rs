@@ -19,6 +19,10 @@ struct EvaluationLine<'a> {
     beta: f64,
     mean: f64,
     min: f64,
+    /// Share of the falls in which the head reaches 1.4 m.
+    rises: f64,
+    /// Share of the falls that end standing.
+    stands: f64,
     returns: &'a [f64],
 }
 
@@ -44,6 +48,11 @@ impl Trainer {
         let returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
         let mean = returns.iter().sum::<f64>() / returns.len() as f64;
         let min = returns.iter().copied().fold(f64::INFINITY, f64::min);
+        let share = |of: fn(&v1::EpisodeResult) -> bool| {
+            episodes.iter().filter(|episode| of(episode)).count() as f64 / episodes.len() as f64
+        };
+        let rises = share(|episode| episode.rises);
+        let stands = share(|episode| episode.stands);
         let version = PolicyVersion::from(policy.version.unwrap_or_default());
         let (beta, stage) = (policy.values["beta"], policy.stage);
         let line = EvaluationLine {
@@ -54,11 +63,13 @@ impl Trainer {
             beta,
             mean,
             min,
+            rises,
+            stands,
             returns: &returns,
         };
         append_line(&self.folder.evaluations(), &line)?;
         let timing = TimingLine {
-            version: line.version,
+            version: line.version.clone(),
             env_steps: line.env_steps,
             updates: line.updates,
             seconds: self.pace.seconds(),
@@ -71,6 +82,8 @@ impl Trainer {
             beta,
             mean,
             min,
+            rises,
+            stands,
             "evaluation"
         );
         self.metrics.evaluations.inc();
@@ -78,21 +91,22 @@ impl Trainer {
         self.metrics.evaluation_return_min.set(min);
         let env_steps = policy.env_steps;
         self.evaluation = Some(v1::EvaluationSummary { version: policy.version, env_steps, mean, min, beta });
-        let result = StageResult { stage, env_steps, min_return: min, mean_return: mean };
+        let result = StageResult { stage, env_steps, min_return: min, mean_return: mean, stand_rate: stands };
         let decision = self.curriculum.report(result, self.progress.env_steps);
-        self.decided(decision, evaluation, (mean, min))
+        self.decided(decision, evaluation, &line)
     }
 
     fn decided(
         &mut self,
         decision: Decision,
         evaluation: &Evaluation,
-        (mean, min): (f64, f64),
+        line: &EvaluationLine<'_>,
     ) -> Result<(), TrainError> {
         let passed = match decision {
             Decision::Ignore | Decision::Stay => None,
+            Decision::Better => Some(line.beta),
             Decision::Promote { passed, next } => {
-                tracing::info!(passed, next, min, "promoted: the next stage is weaker");
+                tracing::info!(passed, next, min = line.min, "promoted: the next stage is weaker");
                 self.metrics.promotions.inc();
                 Some(passed)
             }
@@ -101,7 +115,7 @@ impl Trainer {
                 self.ending = Some(Ending::Curriculum(outcome));
                 match outcome {
                     Outcome::FloorPassed { beta } => Some(beta),
-                    Outcome::StageOutlasted { .. } => None,
+                    Outcome::StageOutlasted { .. } | Outcome::Settled { .. } => None,
                 }
             }
         };
@@ -110,12 +124,15 @@ impl Trainer {
             let mut model = self.describe(model, beta);
             model.metadata.insert("env_steps".into(), evaluation.policy.env_steps.to_string());
             model.metadata.insert("updates".into(), evaluation.updates.to_string());
-            model.metadata.insert("evaluation_mean".into(), mean.to_string());
-            model.metadata.insert("evaluation_min".into(), min.to_string());
-            model.save(self.folder.model(&format!("stage-{}", evaluation.policy.stage)))?;
+            model.metadata.insert("evaluation_mean".into(), line.mean.to_string());
+            model.metadata.insert("evaluation_min".into(), line.min.to_string());
+            model.metadata.insert("evaluation_stands".into(), line.stands.to_string());
+            if decision != Decision::Better {
+                model.save(self.folder.model(&format!("stage-{}", evaluation.policy.stage)))?;
+            }
             model.save(self.folder.model("best"))?;
         }
-        if decision != Decision::Ignore && decision != Decision::Stay {
+        if matches!(decision, Decision::Promote { .. } | Decision::Finish(_)) {
             // On disk before anybody hears of the next stage: the curriculum never goes back.
             self.checkpoint();
             self.checkpoints.finish()?;
