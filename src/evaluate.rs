@@ -67,7 +67,8 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         "--episodes {}: from 1 to 1000000",
         arguments.episodes
     );
-    let Actor { policy, beta, character } = Actor::load(&arguments.model, arguments.beta, arguments.character)?;
+    let Actor { policy, beta, character } =
+        Actor::load(&arguments.model, arguments.beta, arguments.character)?;
     let task = TaskConfig { character, ..TaskConfig::default() };
     let mut evaluator = Evaluator::new(&task, beta.max(1.0), LANES.min(arguments.episodes))?;
     let seeds = unseen_falls(arguments.seed, arguments.episodes);

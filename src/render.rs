@@ -76,8 +76,14 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         (true, false) => "it rises",
         (false, false) => "it does not rise",
     };
-    println!("{}: seconds {} of fall {}, β = {}; {verdict}, return {:.1}", arguments.output.display(),
-        seconds.join(", "), arguments.seed, actor.beta, episode.episode_return);
+    println!(
+        "{}: seconds {} of fall {}, β = {}; {verdict}, return {:.1}",
+        arguments.output.display(),
+        seconds.join(", "),
+        arguments.seed,
+        actor.beta,
+        episode.episode_return
+    );
     Ok(())
 }
 

@@ -1,17 +1,18 @@
 //! The program as its user meets it: results, resumption, and what it says to nonsense.
 
-#![cfg(feature = "learner")]
+#![cfg(all(feature = "learner", feature = "render"))]
 
 mod common;
 
 use std::path::Path;
+use std::process::Command;
 use std::time::Duration;
 
 use common::{Process, fail, free_address, getup, succeed, wait_for};
 use serde_json::Value;
 
 /// `getup train` with the smoke preset in a folder of its own.
-fn train(folder: &Path, arguments: &[&str]) -> std::process::Command {
+fn train(folder: &Path, arguments: &[&str]) -> Command {
     let mut command = getup(&["train", "--preset", "smoke"]);
     command.args(["--set", &format!("network.learner_metrics={}", free_address())]);
     command.args(arguments).current_dir(folder);
@@ -69,6 +70,68 @@ fn a_run_is_interrupted_resumed_and_ended_by_its_steps() {
     // What was refused changed nothing. Past its steps already: it saves and ends.
     let mut resume = getup(&["train", "--run", "run", "--resume", "--steps", "10"]);
     assert!(succeed(resume.current_dir(folder.path())).contains("Done:"));
+}
+
+#[test]
+fn a_run_goes_on_without_its_replay_and_another_begins_with_its_networks() {
+    let folder = tempfile::tempdir().unwrap();
+    succeed(&mut train(folder.path(), &["--run", "first", "--steps", "2000"]));
+    let first = folder.path().join("first");
+    let last = evaluations(&first).pop().unwrap();
+    let (env_steps, updates) = (last["env_steps"].as_u64().unwrap(), last["updates"].as_u64().unwrap());
+
+    // What is carried to another machine: everything but the replay.
+    let carried = folder.path().join("carried");
+    succeed(Command::new("cp").args(["-r", "first", "carried"]).current_dir(folder.path()));
+    std::fs::remove_dir_all(carried.join("replay")).unwrap();
+    let resume = ["train", "--resume", "--run", "carried", "--steps", &(env_steps + 1_000).to_string()];
+    succeed(getup(&resume).args(["--set", "network.learner_metrics=127.0.0.1:0"]).current_dir(folder.path()));
+    let after = evaluations(&carried).pop().unwrap();
+    assert!(after["env_steps"].as_u64().unwrap() >= env_steps + 1_000, "{after}");
+    // The ring is filled before updates go on: at 0.1 updates an env step and 500 env steps for the ring, the
+    // other half of them.
+    let made = after["updates"].as_u64().unwrap() - updates;
+    assert!((1..=100).contains(&made), "{made} updates");
+
+    let checkpoint = std::fs::read_dir(first.join("checkpoints")).unwrap().next().unwrap().unwrap().path();
+    let polish = ["curriculum.fixed=true", "curriculum.patience=1000", "evaluation.every=500"];
+    let mut command = train(folder.path(), &["--run", "second", "--from", checkpoint.to_str().unwrap()]);
+    polish.iter().for_each(|setting| _ = command.args(["--set", setting]));
+    let said = succeed(&mut command);
+    assert!(said.contains("no evaluation was better"), "{said}");
+    let second = evaluations(&folder.path().join("second"));
+    assert_eq!(second[0]["env_steps"], 0);
+    assert!(second[0]["updates"].as_u64().unwrap() >= 1, "{}", second[0]);
+    assert!(second.iter().all(|line| line["stage"] == 0 && line["beta"] == 1.0), "{second:?}");
+    let wider = fail(
+        train(folder.path(), &["--run", "third", "--from", checkpoint.to_str().unwrap()])
+            .args(["--set", "sac.hidden=[8, 8]"]),
+    );
+    assert!(wider.contains("the configured networks have"), "{wider}");
+}
+
+#[test]
+fn a_strip_of_frames_is_a_picture_of_the_size_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    succeed(&mut train(folder.path(), &["--run", "run", "--steps", "600"]));
+    let render =
+        ["render", "run/models/last.safetensors", "--frames", "3", "--height", "64", "--seconds", "1"];
+    let output = common::output(getup(&render).current_dir(folder.path()));
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    if stderr.contains("cannot draw offscreen") {
+        eprintln!("skipped: {stderr}");
+        return;
+    }
+    assert!(output.status.success(), "{stderr}");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("seconds 0.00, 0.50, 1.00 of fall 0"));
+    let picture = std::fs::File::open(folder.path().join("strip.png")).unwrap();
+    let mut reader = png::Decoder::new(std::io::BufReader::new(picture)).read_info().unwrap();
+    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+    let info = reader.next_frame(&mut pixels).unwrap();
+    assert_eq!((info.width, info.height), (3 * 48, 64));
+    // Sky, floor and a character.
+    let colours: std::collections::BTreeSet<&[u8]> = pixels.chunks_exact(3).collect();
+    assert!(colours.len() > 100, "{} colours", colours.len());
 }
 
 #[test]

@@ -410,6 +410,7 @@ mod tests {
                 let stage = curriculum.stage().saturating_sub(age);
                 let decision = curriculum.report(result(stage, now, min_return), now);
                 match decision {
+                    Decision::Better => prop_assert!(false, "β is not fixed"),
                     Decision::Ignore | Decision::Stay => prop_assert_eq!(&curriculum, &before),
                     Decision::Promote { passed, next } => {
                         prop_assert!(min_return > 60.0 && stage == before.stage());

@@ -1,6 +1,6 @@
 //! What a network looks like: its layers, in order, with the names of their tensors.
 //!
-//! The learner's network and the actor's forward pass are both built from [`PolicyShape::layers`].
+//! The learner's network and the actor's forward pass are both built from [`PolicyShape::tensors`].
 
 use serde::{Deserialize, Serialize};
 

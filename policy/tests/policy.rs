@@ -1,22 +1,21 @@
 //! The policy against a plain reference, and its file against damage.
 
 use getup_policy::{
-    Body, Forward, LOG_STD_MAX, LOG_STD_MIN, ModelError, ObservationStatistics, Policy, PolicyShape,
+    Body, Forward, LOG_STD_MAX, LOG_STD_MIN, ModelError, NORM_EPSILON, ObservationStatistics, Policy,
+    PolicyShape,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 fn shapes() -> Vec<PolicyShape> {
-    [vec![], vec![5], vec![32, 17], vec![256, 256], vec![64, 64, 64]]
-        .into_iter()
-        .flat_map(|hidden| {
-            [(68, 21), (1, 1), (7, 3)].map(|(observation, action)| PolicyShape {
-                observation,
-                action,
-                body: Body::Mlp { hidden: hidden.clone() },
-            })
-        })
-        .collect()
+    let hidden = [vec![], vec![5], vec![32, 17], vec![256, 256], vec![64, 64, 64]];
+    let simba = [(128, 1), (5, 2), (33, 0)].map(|(width, blocks)| Body::Simba { width, blocks });
+    let bodies = hidden.into_iter().map(|hidden| Body::Mlp { hidden }).chain(simba);
+    let widths = [(68, 21), (1, 1), (7, 3)];
+    let shape = |body: Body| {
+        widths.map(|(observation, action)| PolicyShape { observation, action, body: body.clone() })
+    };
+    bodies.flat_map(shape).collect()
 }
 
 fn random_policy(shape: PolicyShape, rng: &mut ChaCha8Rng) -> Policy {
@@ -47,9 +46,32 @@ fn reference(policy: &Policy, observation: &[f32]) -> (Vec<f64>, Vec<f64>) {
             })
             .collect()
     };
-    let layers = policy.shape.layers();
-    for layer in &layers[..layers.len() - 2] {
-        values = apply(&layer.name, &values).into_iter().map(|x| x.max(0.0)).collect();
+    let relu = |values: Vec<f64>| -> Vec<f64> { values.into_iter().map(|x| x.max(0.0)).collect() };
+    let norm = |name: &str, input: &[f64]| -> Vec<f64> {
+        let count = input.len() as f64;
+        let mean = input.iter().sum::<f64>() / count;
+        let variance = input.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count;
+        let weight = policy.tensor(&format!("{name}.weight"));
+        let parameters = weight.iter().zip(policy.tensor(&format!("{name}.bias")));
+        let normal = input.iter().map(|x| (x - mean) / (variance + f64::from(NORM_EPSILON)).sqrt());
+        normal.zip(parameters).map(|(x, (weight, bias))| x * f64::from(*weight) + f64::from(*bias)).collect()
+    };
+    match &policy.shape.body {
+        Body::Mlp { hidden } => {
+            for index in 0..hidden.len() {
+                values = relu(apply(&format!("body.{index}"), &values));
+            }
+        }
+        Body::Simba { blocks, .. } => {
+            values = apply("body.embed", &values);
+            for block in 0..*blocks {
+                let inner =
+                    relu(apply(&format!("body.{block}.up"), &norm(&format!("body.{block}.norm"), &values)));
+                let change = apply(&format!("body.{block}.down"), &inner);
+                values.iter_mut().zip(change).for_each(|(value, change)| *value += change);
+            }
+            values = norm("body.norm", &values);
+        }
     }
     let (low, high) = (f64::from(LOG_STD_MIN), f64::from(LOG_STD_MAX));
     let log_std = apply("head.log_std", &values);

@@ -5,7 +5,6 @@
 //! what its folder holds, so that the same command goes on wherever the last one was stopped.
 
 use std::collections::VecDeque;
-use std::ffi::c_int;
 use std::fmt;
 use std::fs::{self, File};
 use std::num::NonZeroUsize;
@@ -223,17 +222,12 @@ fn last_env_steps(evaluations: &str) -> Option<u64> {
 
 /// Ctrl-C reaches the runs from the terminal, and they save; this process waits for them, and begins no other.
 fn outlive_interrupts() {
-    const SIGINT: c_int = 2;
-    unsafe extern "C" {
-        /// C's own; returns the handler before.
-        fn signal(number: c_int, handler: extern "C" fn(c_int)) -> usize;
-    }
-    extern "C" fn note(_: c_int) {
+    extern "C" fn note(_: libc::c_int) {
         INTERRUPTED.store(true, Ordering::Relaxed);
     }
-    // SAFETY: the declaration is the C standard's, the number is valid, and the handler only stores to a lock-free
-    // atomic, which a signal handler may. A program started later has the default again: exec resets handlers.
-    unsafe { signal(SIGINT, note) };
+    // SAFETY: the handler only stores to a lock-free atomic, which a signal handler may. A program started later has
+    // the default again: exec resets handlers.
+    unsafe { libc::signal(libc::SIGINT, note as extern "C" fn(libc::c_int) as libc::sighandler_t) };
 }
 
 #[cfg(test)]

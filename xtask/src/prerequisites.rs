@@ -5,8 +5,21 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context, Result, bail};
 
-/// Debian packages that tests use; a test that misses one says what it skips.
-const DEBIAN_PACKAGES: &[(&str, &str)] = &[("prometheus", "promtool")];
+/// Debian packages that tests use, each with what tells that it is there; a test that misses one says what it skips.
+const DEBIAN_PACKAGES: &[(&str, Sign)] = &[
+    ("prometheus", Sign::Program("promtool")),
+    ("libegl1", Sign::Library("libEGL.so.1")),
+    ("libgles2", Sign::Library("libGLESv2.so.2")),
+    ("libgl1-mesa-dri", Sign::Library("dri")),
+];
+
+/// What tells that a package is there.
+enum Sign {
+    /// On the PATH.
+    Program(&'static str),
+    /// A file or a folder among the system's libraries.
+    Library(&'static str),
+}
 
 /// Refuses with the name of a missing prerequisite and how to install it.
 pub(crate) fn check() -> Result<()> {
@@ -31,11 +44,8 @@ pub(crate) fn check() -> Result<()> {
 
 /// Installs the tests' Debian packages when run as root on Debian; elsewhere prints the command.
 pub(crate) fn install_debian_packages() -> Result<()> {
-    let missing: Vec<&str> = DEBIAN_PACKAGES
-        .iter()
-        .filter(|(_, program)| !on_path(program))
-        .map(|(package, _)| *package)
-        .collect();
+    let missing: Vec<&str> =
+        DEBIAN_PACKAGES.iter().filter(|(_, sign)| !sign.is_seen()).map(|(package, _)| *package).collect();
     if missing.is_empty() {
         return Ok(());
     }
@@ -77,9 +87,18 @@ fn runs(program: &str, arguments: &[&str]) -> bool {
         .is_ok_and(|status| status.success())
 }
 
-fn on_path(program: &str) -> bool {
-    std::env::var_os("PATH")
-        .is_some_and(|path| std::env::split_paths(&path).any(|folder| folder.join(program).is_file()))
+impl Sign {
+    fn is_seen(&self) -> bool {
+        match self {
+            Self::Program(name) => {
+                let path = std::env::var_os("PATH").unwrap_or_default();
+                std::env::split_paths(&path).any(|folder| folder.join(name).is_file())
+            }
+            Self::Library(name) => ["/usr/lib/x86_64-linux-gnu", "/usr/lib64", "/usr/lib"]
+                .iter()
+                .any(|folder| Path::new(folder).join(name).exists()),
+        }
+    }
 }
 
 fn is_root() -> bool {
