@@ -80,7 +80,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let episodes = match &arguments.record {
         Some(path) => {
             let (episodes, file) = evaluator.record(&policy, beta, &seeds, progress)?;
-            write_file(path, &file.to_json())?;
+            write_file(path, file.to_json())?;
             episodes
         }
         None => evaluator.evaluate(&policy, beta, &seeds, progress)?,

@@ -31,7 +31,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let played = RolloutFile::parse(&text)
         .and_then(|file| replay(&file, arguments.character))
         .with_context(|| input.display().to_string())?;
-    write_file(&arguments.output, &played.to_json())?;
+    write_file(&arguments.output, played.to_json())?;
     let steps: usize = played.rollouts.iter().map(|rollout| rollout.rewards.len()).sum();
     let (count, output) = (played.rollouts.len(), arguments.output.display());
     eprintln!(

@@ -157,7 +157,7 @@ fn forward(body: &Body, input: &Tensor, parameters: &[&Tensor], products: Kind) 
             for _ in 0..*blocks {
                 let hidden = norm(&x, next());
                 let inner = linear(&hidden, next()).relu();
-                x = x + linear(&inner, next()).to_kind(Kind::Float);
+                x += linear(&inner, next()).to_kind(Kind::Float);
             }
             norm(&x, next())
         }

@@ -478,7 +478,7 @@ fn minimum<'a>(
         critic.forward(values, weights, input, trace);
         for (value, q) in value.iter_mut().zip(&trace.outputs[0][..]) {
             // NaN counts as the minimum, so that it is noticed.
-            *value = if index == 0 || !(*q >= *value) { *q } else { *value };
+            *value = if index > 0 && (value.is_nan() || *q >= *value) { *value } else { *q };
         }
     }
 }
