@@ -115,8 +115,8 @@ impl Default for Config {
 /// Where a role's configuration comes from: what every role's command line shares.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct ConfigArgs {
-    /// Settings to start from: `smoke` (a minute, for tests), `laptop` (two to eight cores), `paper` (Table 1 of
-    /// the paper to the letter), `gpu`. [default: laptop]
+    /// Settings to start from: `smoke` (a minute, for tests), `laptop` (two to eight cores), `standing` (with `--from`:
+    /// what laptop learned learns to stay up), `paper` (Table 1 of the paper to the letter), `gpu`. [default: laptop]
     #[arg(long, value_name = "NAME")]
     pub(crate) preset: Option<String>,
     /// A configuration file over the preset, such as a run's own config.toml.
@@ -217,13 +217,14 @@ impl Config {
             run: self.run.clone(),
             // Whoever simulates otherwise is refused: transitions and evaluations must be of one kind.
             task: format!(
-                "{}/{}, {} Hz, falls of {} steps with {}, {} steps, stand {:?}, clamp {}",
+                "{}/{}, {} Hz, falls of {} steps with {}, {} steps{}, stand {:?}, clamp {}",
                 self.task.name,
                 self.task.character,
                 self.task.physics_hz,
                 self.task.ragdoll_steps,
                 self.task.ragdoll_std,
                 self.task.episode_steps,
+                if self.task.fall_ends { " or to a fall" } else { "" },
                 self.task.stand,
                 self.control_limit()
             ),

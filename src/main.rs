@@ -39,28 +39,19 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Train a character in one process.
+    // Each is described where its arguments are.
     #[cfg(feature = "learner")]
     Train(train::Args),
-    /// Run the replay: stores what actors push, and serves minibatches.
     Replay(replay::Args),
-    /// Run the learner: trains, broadcasts policies, advances the curriculum.
     #[cfg(feature = "learner")]
     Learner(learner::Args),
-    /// Run an actor: simulates episodes under the newest policy.
     Actor(actor::Args),
-    /// Measure a trained policy on falls it has not seen.
     Evaluate(evaluate::Args),
-    /// Draw a strip of frames of one get-up.
     #[cfg(feature = "render")]
     Render(render::Args),
-    /// Replay recorded states and actions, and write what the simulation makes of them.
     Rollout(rollout::Args),
-    /// Write the states in which falls begin and end.
     Falls(falls::Args),
-    /// Check this machine and a configuration before a run does.
     Doctor(doctor::Args),
-    /// Ask a running cluster who waits on whom, and why.
     Status(status::Args),
 }
 

@@ -35,8 +35,8 @@ pub(crate) struct Args {
     /// Go on with the run in that folder, under its own config.toml.
     #[arg(long)]
     resume: bool,
-    /// Begin a new run with the networks of this checkpoint instead of untrained ones: a file of another run's
-    /// checkpoints/. Its curriculum and its env steps begin anew.
+    /// Begin a new run with the actor of this checkpoint, a file of another run's checkpoints/, and with its critics
+    /// where they have the configured shape. Curriculum and counters begin anew.
     #[arg(long, value_name = "FILE", conflicts_with = "resume")]
     from: Option<PathBuf>,
     /// Every random draw comes from it. [default: 0]

@@ -148,26 +148,48 @@ impl Checkpoint {
 
     /// Puts the networks' state into `sac`, which has the same configuration.
     pub fn restore(&self, sac: &mut Sac) -> Result<(), CheckpointError> {
-        for (name, tensor) in buffers(sac) {
-            let (found, wanted) = (self.tensors[name].len(), tensor.numel());
+        self.put(sac, |_| true)?;
+        sac.critics_adam.steps = self.scalars.critics_steps;
+        sac.updates = self.scalars.updates;
+        sac.rng = self.scalars.rng.clone();
+        Ok(())
+    }
+
+    /// Lets `sac`, whose run is another, begin with this actor, its temperature and its observations' statistics; and
+    /// with these critics, where `sac` has such.
+    pub fn begin(&self, sac: &mut Sac) -> Result<(), CheckpointError> {
+        let same = self.tensors["critics"].len() == sac.critics.parameters.flat().numel();
+        self.put(sac, |name| same || name.starts_with("actor"))?;
+        if same {
+            sac.critics_adam.steps = self.scalars.critics_steps;
+        } else {
+            tracing::info!(
+                "the checkpoint's critics have another shape than the configured: they begin untrained"
+            );
+        }
+        Ok(())
+    }
+
+    /// Puts what both have in common: the buffers that `wanted` names, temperature, statistics, the actor's steps.
+    fn put(&self, sac: &mut Sac, wanted: impl Fn(&str) -> bool) -> Result<(), CheckpointError> {
+        let buffers: Vec<_> = buffers(sac).into_iter().filter(|(name, _)| wanted(name)).collect();
+        for (name, tensor) in &buffers {
+            let (found, wanted) = (self.tensors[*name].len(), tensor.numel());
             if found != wanted {
-                return Err(CheckpointError::Shape { name: name.into(), found, wanted });
+                return Err(CheckpointError::Shape { name: (*name).into(), found, wanted });
             }
         }
         let _guard = tch::no_grad_guard();
-        for (name, tensor) in buffers(sac) {
+        for (name, tensor) in buffers {
             tensor.shallow_clone().copy_(&Tensor::from_slice(&self.tensors[name]));
         }
         let scalars = self.scalars.clone();
         let learning_rate = sac.temperature_adam.learning_rate;
         sac.temperature_adam = scalars.temperature_adam;
         sac.temperature_adam.learning_rate = learning_rate;
-        sac.updates = scalars.updates;
         sac.actor_adam.steps = scalars.actor_steps;
-        sac.critics_adam.steps = scalars.critics_steps;
         sac.log_temperature = scalars.log_temperature;
         sac.statistics = scalars.statistics;
-        sac.rng = scalars.rng;
         sac.changed();
         Ok(())
     }

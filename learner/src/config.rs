@@ -66,8 +66,10 @@ pub struct SacConfig {
     pub target_entropy: TargetEntropy,
     /// Updates for every env step; the rate limiter keeps it.
     pub updates_per_step: f64,
-    /// Env steps of uniform actions before the first update.
+    /// Env steps of uniform actions before the first update; where the run begins with trained networks, of theirs.
     pub uniform_steps: u64,
+    /// Updates at the start that leave the actor as it is: for one that begins trained, with critics that do not.
+    pub critics_first: u64,
     /// Precision of the hidden layers' matrix products; weights, heads and losses are always float32.
     pub precision: Precision,
     /// Whether observations are normalised by running statistics.
@@ -177,6 +179,7 @@ impl Default for SacConfig {
             target_entropy: TargetEntropy::Auto(Auto::Auto),
             updates_per_step: 1.0,
             uniform_steps: 10_000,
+            critics_first: 0,
             precision: Precision::Fp32,
             normalize_observations: false,
             normalize_until: 300_000,

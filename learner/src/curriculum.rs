@@ -2,7 +2,7 @@
 //!
 //! Stage i trains with the torque-limit multiplier β^i. An evaluation whose minimum return exceeds ω passes the
 //! stage and β becomes β·decay, never under the floor; a pass at the floor ends the curriculum. Stage 0 is the
-//! discovery and has no limit. A later stage may last M_i = clip(1.5·N_{i−1}, N_min, N_max) env steps; an
+//! discovery and has no limit, and neither has a stage that follows one above 1. A later stage may last M_i = clip(1.5·N_{i−1}, N_min, N_max) env steps; an
 //! evaluation past that without a pass ends the curriculum, with β of the last stage that passed.
 //!
 //! Evaluations must be given in the order of their versions. One of an earlier stage counts for nothing.
@@ -87,7 +87,7 @@ pub struct Curriculum {
     beta: f64,
     /// Env steps of the run when this stage began.
     stage_start: u64,
-    /// M_i; none in stage 0.
+    /// M_i; none in the discovery.
     stage_limit: Option<u64>,
     /// β of the last stage that passed.
     passed: Option<f64>,
@@ -137,7 +137,7 @@ impl Curriculum {
         self.outcome.map_or(self.beta, Outcome::beta)
     }
 
-    /// M_i, in env steps; none in stage 0.
+    /// M_i, in env steps; none in the discovery.
     pub fn stage_limit(&self) -> Option<u64> {
         self.stage_limit
     }
@@ -212,8 +212,11 @@ impl Curriculum {
         self.stage += 1;
         self.beta = self.next_beta();
         self.stage_start = now;
-        let limit = (steps as f64 * 1.5).round() as u64;
-        self.stage_limit = Some(limit.clamp(self.config.n_min, self.config.n_max));
+        // From above 1 the discovery goes on until β = 1 is passed.
+        self.stage_limit = (passed <= 1.0).then(|| {
+            let limit = (steps as f64 * 1.5).round() as u64;
+            limit.clamp(self.config.n_min, self.config.n_max)
+        });
         Decision::Promote { passed, next: self.beta }
     }
 
@@ -417,8 +420,9 @@ mod tests {
                         prop_assert!(next < passed && next >= floor);
                         prop_assert!(!(passed > 1.0 && next < 1.0));
                         prop_assert_eq!(curriculum.stage(), before.stage() + 1);
-                        let limit = curriculum.stage_limit().unwrap();
-                        prop_assert!((300_000..=800_000).contains(&limit));
+                        let limit = curriculum.stage_limit();
+                        prop_assert_eq!(limit.is_none(), passed > 1.0);
+                        prop_assert!(limit.is_none_or(|limit| (300_000..=800_000).contains(&limit)));
                     }
                     Decision::Finish(outcome) => {
                         prop_assert!(before.outcome().is_none());

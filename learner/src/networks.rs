@@ -157,7 +157,8 @@ fn forward(body: &Body, input: &Tensor, parameters: &[&Tensor], products: Kind) 
             for _ in 0..*blocks {
                 let hidden = norm(&x, next());
                 let inner = linear(&hidden, next()).relu();
-                x += linear(&inner, next()).to_kind(Kind::Float);
+                // Not `+=`, which would change in place what autograd has kept.
+                x = linear(&inner, next()).to_kind(Kind::Float) + &x;
             }
             norm(&x, next())
         }

@@ -138,6 +138,11 @@ impl Sac {
         self.updates
     }
 
+    /// Whether any update was made, by this run or by the one whose networks it begins with.
+    pub fn is_trained(&self) -> bool {
+        self.updates > 0 || self.actor_adam.steps > 0
+    }
+
     /// Merges a batch's observations into the statistics that normalise them, where the run normalises.
     pub fn merge_statistics(&mut self, batch: &Batch) {
         if self.config.normalize_observations {
@@ -209,8 +214,10 @@ impl Sac {
         let value = self.critics.minimum(&observation, &sample.action);
         let actor_loss = (&sample.log_prob * temperature - value).mean(Kind::Float);
         let actor = self.finite("actor", actor_loss.double_value(&[]))?;
-        let gradient = self.actor.parameters.gradient(&actor_loss);
-        self.actor_adam.step(&mut self.actor.parameters, &gradient);
+        if self.actor_learns() {
+            let gradient = self.actor.parameters.gradient(&actor_loss);
+            self.actor_adam.step(&mut self.actor.parameters, &gradient);
+        }
 
         let entropy = -sample.log_prob.mean(Kind::Float).double_value(&[]);
         polyak(&mut self.targets.parameters, &self.critics.parameters, self.config.tau);
@@ -243,17 +250,26 @@ impl Sac {
 
         let policy = cpu.actor_backward(&inputs, Values { actor, critics, targets });
         let actor_loss = self.finite("actor", policy.loss)?;
-        let step = self.actor_adam.begin_step();
-        let (first, second) = self.actor_adam.moments();
-        cpu.actor_step(Flat { values: actor, first, second }, step);
+        if self.actor_learns() {
+            let step = self.actor_adam.begin_step();
+            let (first, second) = self.actor_adam.moments();
+            cpu.actor_step(Flat { values: actor, first, second }, step);
+        }
         Ok(self.end_update(critic_loss, actor_loss, policy.value, critic.value))
+    }
+
+    /// Whether the critics have had their updates alone.
+    fn actor_learns(&self) -> bool {
+        self.updates >= self.config.critics_first
     }
 
     /// The temperature's step, along the gradient of mean α (−log π − H̄) by log α; and the count.
     fn end_update(&mut self, critic: f64, actor: f64, entropy: f64, q: f64) -> Losses {
         let gradient = self.log_temperature.exp() * (entropy - self.target_entropy);
         let floor = self.config.temperature_floor.ln();
-        self.log_temperature = self.temperature_adam.step(self.log_temperature, gradient).max(floor);
+        if self.actor_learns() {
+            self.log_temperature = self.temperature_adam.step(self.log_temperature, gradient).max(floor);
+        }
         self.updates += 1;
         Losses { critic, actor, temperature: self.log_temperature.exp(), entropy, q }
     }

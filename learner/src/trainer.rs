@@ -102,8 +102,8 @@ pub enum Ending {
 pub enum Start<'a> {
     /// Networks drawn from the seed.
     Untrained,
-    /// The networks of another run's checkpoint, with all that their updates need. Curriculum and env steps begin
-    /// anew.
+    /// The actor of another run's checkpoint, and its critics where they have the configured shape. Curriculum and
+    /// counters begin anew.
     Checkpoint(&'a Path),
     /// Where the run's newest checkpoint stands, if it has one.
     Newest,
@@ -146,7 +146,7 @@ impl Trainer {
         let resumed = match start {
             Start::Untrained => None,
             Start::Checkpoint(path) => {
-                Checkpoint::load(path)?.restore(&mut sac)?;
+                Checkpoint::load(path)?.begin(&mut sac)?;
                 None
             }
             Start::Newest => Checkpoint::newest(&folder.checkpoints())?,

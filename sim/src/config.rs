@@ -23,6 +23,9 @@ pub struct TaskConfig {
     pub episode_steps: usize,
     /// The shape of the reward's `stand` term.
     pub stand: Stand,
+    /// Whether falling ends a training episode for good: a head that was over 1.4 m sinks under 1 m. Without, a fall
+    /// costs no more than the second that it takes to rise again.
+    pub fall_ends: bool,
 }
 
 /// The shape of the reward's `stand` term (App. B.1).
@@ -46,6 +49,7 @@ impl Default for TaskConfig {
             ragdoll_std: 0.1,
             episode_steps: 250,
             stand: Stand::LongTail,
+            fall_ends: false,
         }
     }
 }

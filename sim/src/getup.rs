@@ -13,6 +13,11 @@ const DROP_HEIGHT: f64 = 1.5;
 /// Head height of a standing character, in metres.
 const STAND_HEIGHT: f64 = 1.55;
 
+/// A head over this was up, in metres…
+const UP_HEIGHT: f64 = 1.4;
+/// …and under this it has fallen.
+const DOWN_HEIGHT: f64 = 1.0;
+
 /// The standing pose (the slower stage's target), hinge by hinge, in radians.
 const STANDING_POSE: [(&str, f64); 21] = [
     ("abdomen_z", 0.0),
@@ -48,6 +53,7 @@ pub struct GetUp {
     episode_steps: usize,
     control_limit: f64,
     stand: Stand,
+    fall_ends: bool,
     resets: Resets,
     standing: Standing,
     bodies: Bodies,
@@ -93,6 +99,7 @@ impl GetUp {
             episode_steps: config.episode_steps,
             control_limit,
             stand: config.stand,
+            fall_ends: config.fall_ends,
             resets: Resets::new(vec![(1.0, Source::Fall(fall))])?,
             bodies: Bodies {
                 torso: world.body("torso")?,
@@ -211,6 +218,10 @@ impl Task for GetUp {
             self.feet(world),
         ]);
         terms.iter().product()
+    }
+
+    fn is_terminal(&self, world: &World, highest: f64) -> bool {
+        self.fall_ends && highest >= UP_HEIGHT && world.head_height() < DOWN_HEIGHT
     }
 }
 

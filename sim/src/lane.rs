@@ -63,6 +63,8 @@ pub struct Lane {
     beta: f64,
     /// Steps done in this phase.
     steps: usize,
+    /// The highest that the head was in this phase, in metres.
+    highest: f64,
     recording: Recording,
     observation: Vec<f64>,
     terms: Vec<f64>,
@@ -87,6 +89,7 @@ impl Lane {
             fall: None,
             beta: 1.0,
             steps: 0,
+            highest: 0.0,
             recording: Recording {
                 qpos0: world.qpos().to_vec(),
                 qvel0: world.qvel().to_vec(),
@@ -149,6 +152,7 @@ impl Lane {
             .expect("a drawn, given or landed state has the right lengths and sane numbers");
         actions.clear();
         self.steps = 0;
+        self.highest = 0.0;
         self.look();
     }
 
@@ -156,6 +160,7 @@ impl Lane {
     fn look(&mut self) {
         self.task.observe(&self.world, self.beta, &mut self.observation);
         self.reward = self.task.reward(&self.world, &mut self.terms);
+        self.highest = self.highest.max(self.world.head_height());
     }
 
     /// Where in its episode the lane is.
@@ -210,7 +215,7 @@ impl Lane {
         let in_control = self.fall.is_none() && !landed;
         Ok(Step {
             reward: self.reward as f32,
-            terminal: in_control && self.task.is_terminal(&self.world),
+            terminal: in_control && self.task.is_terminal(&self.world, self.highest),
             truncated: in_control && self.steps >= self.task.episode_steps(),
             landed,
         })

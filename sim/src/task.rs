@@ -44,8 +44,9 @@ pub trait Task: Send + Sync {
     /// Writes the reward's terms for being in the world's state, and returns the reward.
     fn reward(&self, world: &World, terms: &mut [f64]) -> f64;
 
-    /// Whether the world's state ends the episode for good, so that nothing follows it.
-    fn is_terminal(&self, _world: &World) -> bool {
+    /// Whether the world's state ends the episode for good, so that nothing follows it. `highest` is the highest that
+    /// the head was in the control phase, in metres.
+    fn is_terminal(&self, _world: &World, _highest: f64) -> bool {
         false
     }
 

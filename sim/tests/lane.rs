@@ -315,3 +315,35 @@ fn a_high_start_depends_on_its_seed_alone_and_ends_its_limp_steps_like_a_fall() 
         }
     }
 }
+
+#[test]
+fn where_falling_ends_an_episode_only_a_head_that_was_up_and_sinks_ends_it() {
+    let mut lane = lane(&TaskConfig { fall_ends: true, ..TaskConfig::default() });
+    let (mut ended, mut endless) = (0, standard());
+    for seed in 0..20 {
+        lane.begin_standing(seed, 1.0);
+        endless.begin_standing(seed, 1.0);
+        fall(&mut lane);
+        fall(&mut endless);
+        let mut highest = lane.head_height();
+        for step in 1..=250 {
+            let (outcome, same) = (lane.step(&[0.0; 21]).unwrap(), endless.step(&[0.0; 21]).unwrap());
+            assert!(!same.terminal);
+            highest = highest.max(lane.head_height());
+            assert_eq!(
+                outcome.terminal,
+                highest >= 1.4 && lane.head_height() < 1.0,
+                "seed {seed}, step {step}"
+            );
+            if outcome.terminal {
+                ended += 1;
+                break;
+            }
+        }
+    }
+    // Limp, nobody stands for six seconds; some starts are limp for so long that the head is never up.
+    assert!((8..20).contains(&ended), "{ended} of 20");
+    lane.begin(1, 1.0);
+    fall(&mut lane);
+    assert!((1..=250).all(|step| !lane.step(&action(step)).unwrap().terminal));
+}

@@ -10,9 +10,10 @@ use toml::{Table, Value};
 use super::Config;
 
 /// The presets: a name, and the settings in which it differs from the defaults.
-pub(super) const PRESETS: [(&str, &str); 4] = [
+pub(super) const PRESETS: [(&str, &str); 5] = [
     ("smoke", include_str!("../presets/smoke.toml")),
     ("laptop", include_str!("../presets/laptop.toml")),
+    ("standing", include_str!("../presets/standing.toml")),
     ("paper", include_str!("../presets/paper.toml")),
     ("gpu", include_str!("../presets/gpu.toml")),
 ];

@@ -37,7 +37,7 @@ impl Trainer {
             .into(),
             stage: self.curriculum.stage(),
             env_steps: self.progress.env_steps,
-            uniform: self.progress.env_steps < self.config.sac.uniform_steps && self.sac.updates() == 0,
+            uniform: self.progress.env_steps < self.config.sac.uniform_steps && !self.sac.is_trained(),
             finished,
         });
         self.metrics.policy_version.set(self.version.counter as i64);
