@@ -103,8 +103,12 @@ fn print_learner(reply: &v1::StatusReply) {
     );
     println!("         {}", or_nobody(&reply.waiting));
     if let Some(evaluation) = &reply.evaluation {
-        let (at, mean, min) = (evaluation.env_steps, evaluation.mean, evaluation.min);
-        println!("         last evaluation at {at} env steps: mean {mean:.1}, minimum {min:.1}");
+        let v1::EvaluationSummary { env_steps, mean, min, .. } = evaluation;
+        let [rises, stands] = [evaluation.rises, evaluation.stands].map(|share| 100.0 * share);
+        println!(
+            "         last evaluation at {env_steps} env steps: mean return {mean:.1}, minimum {min:.1}, rises \
+             {rises:.0} %, stands {stands:.0} %"
+        );
     }
     for actor in &reply.actors {
         let activity = if actor.waiting.is_empty() { "steps" } else { actor.waiting.as_str() };
@@ -145,6 +149,7 @@ fn learner_json(reply: &v1::StatusReply) -> serde_json::Value {
         "evaluation": reply.evaluation.as_ref().map(|evaluation| json!({
             "env_steps": evaluation.env_steps, "mean": evaluation.mean, "min": evaluation.min,
             "beta": evaluation.beta, "version": version(evaluation.version),
+            "rises": evaluation.rises, "stands": evaluation.stands,
         })),
         "actors": reply.actors.iter().map(|actor| json!({
             "name": actor.name, "env_steps": actor.env_steps, "version": version(actor.version),

@@ -54,6 +54,10 @@ pub struct SacConfig {
     pub actor_lr: f64,
     /// Adam's learning rate of the critics.
     pub critic_lr: f64,
+    /// What the learning rates of actor and critics fall to, as a share of themselves, over `lr_steps`.
+    pub lr_final: f64,
+    /// Env steps over which they fall, linearly; 0 for constant ones.
+    pub lr_steps: u64,
     /// Share of every weight that decays with a step, in units of the learning rate (AdamW); 0 for Adam.
     pub weight_decay: f64,
     /// Adam's learning rate of the temperature's logarithm.
@@ -172,6 +176,8 @@ impl Default for SacConfig {
             tau: 0.005,
             actor_lr: 1e-5,
             critic_lr: 1e-4,
+            lr_final: 1.0,
+            lr_steps: 0,
             weight_decay: 0.0,
             temperature_lr: 1e-4,
             initial_temperature: 0.1,
@@ -209,6 +215,7 @@ impl SacConfig {
             ("sac.actor_lr", self.actor_lr),
             ("sac.critic_lr", self.critic_lr),
             ("sac.temperature_lr", self.temperature_lr),
+            ("sac.lr_final", self.lr_final),
             ("sac.weight_decay", self.weight_decay),
         ] {
             check((0.0..=1.0).contains(&rate), key, &rate, "from 0 to 1")?;
@@ -226,6 +233,15 @@ impl SacConfig {
         check(entropy.is_finite(), "sac.target_entropy", &entropy, "a number of nats, or \"auto\"")?;
         let rate = self.updates_per_step;
         check(rate > 0.0 && rate <= 100.0, "sac.updates_per_step", &rate, "over 0, at most 100")
+    }
+
+    /// What the learning rates of actor and critics are multiplied with at `env_steps` of the run.
+    pub fn lr_scale(&self, env_steps: u64) -> f64 {
+        if self.lr_steps == 0 {
+            return 1.0;
+        }
+        let done = (env_steps as f64 / self.lr_steps as f64).min(1.0);
+        1.0 + (self.lr_final - 1.0) * done
     }
 
     /// The actor's shape for a task.
@@ -429,5 +445,19 @@ impl LearnerConfig {
     pub fn effective_threads(&self) -> usize {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         if self.threads > 0 { self.threads } else { cores.min(2).max(cores.saturating_sub(1)) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn learning_rates_fall_linearly_and_stay_where_they_fell_to() {
+        let config = SacConfig { lr_final: 0.1, lr_steps: 1000, ..SacConfig::default() };
+        for (env_steps, scale) in [(0, 1.0), (500, 0.55), (1000, 0.1), (9000, 0.1)] {
+            assert!((config.lr_scale(env_steps) - scale).abs() < 1e-12, "{env_steps}");
+        }
+        assert_eq!(SacConfig::default().lr_scale(9000), 1.0);
     }
 }

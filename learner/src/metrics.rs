@@ -29,6 +29,8 @@ pub(crate) struct LearnerMetrics {
     pub(crate) evaluations_outstanding: IntGauge,
     pub(crate) evaluation_return_mean: Gauge,
     pub(crate) evaluation_return_min: Gauge,
+    pub(crate) evaluation_rise_rate: Gauge,
+    pub(crate) evaluation_stand_rate: Gauge,
     pub(crate) promotions: IntCounter,
     pub(crate) checkpoints: IntCounter,
     pub(crate) checkpoint_seconds: Histogram,
@@ -82,6 +84,14 @@ impl LearnerMetrics {
             ),
             evaluation_return_mean: gauge("evaluation_return_mean", "Mean return of the newest evaluation."),
             evaluation_return_min: gauge("evaluation_return_min", "Minimum return of the newest evaluation."),
+            evaluation_rise_rate: gauge(
+                "evaluation_rise_rate",
+                "Share of the newest evaluation's falls from which it rises.",
+            ),
+            evaluation_stand_rate: gauge(
+                "evaluation_stand_rate",
+                "Share of the newest evaluation's falls after which it stands.",
+            ),
             promotions: counter("promotions_total", "Stages passed since this process started."),
             checkpoints: counter("checkpoints_total", "Checkpoints written since this process started."),
             checkpoint_seconds: seconds("checkpoint_seconds", "Time to write a checkpoint, beside training."),

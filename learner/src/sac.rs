@@ -143,6 +143,13 @@ impl Sac {
         self.updates > 0 || self.actor_adam.steps > 0
     }
 
+    /// Sets the learning rates of actor and critics for `env_steps` of the run.
+    pub fn anneal(&mut self, env_steps: u64) {
+        let scale = self.config.lr_scale(env_steps);
+        self.actor_adam.learning_rate = self.config.actor_lr * scale;
+        self.critics_adam.learning_rate = self.config.critic_lr * scale;
+    }
+
     /// Merges a batch's observations into the statistics that normalise them, where the run normalises.
     pub fn merge_statistics(&mut self, batch: &Batch) {
         if self.config.normalize_observations {

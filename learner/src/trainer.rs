@@ -224,6 +224,7 @@ impl Trainer {
         if self.progress.env_steps < self.config.sac.normalize_until {
             self.sac.merge_statistics(&batch);
         }
+        self.sac.anneal(self.progress.env_steps);
         let losses = self.sac.update(&batch)?;
         self.metrics.updates.inc();
         self.metrics.update_seconds.observe(started.elapsed().as_secs_f64());

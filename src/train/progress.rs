@@ -109,7 +109,11 @@ impl Display {
             parts.push(format!("first {} env steps of uniform actions", self.uniform_steps));
         }
         if let Some(evaluation) = &standing.evaluation {
-            parts.push(format!("last evaluation: mean {:.1}, min {:.1}", evaluation.mean, evaluation.min));
+            let [rises, stands] = [evaluation.rises, evaluation.stands].map(|share| 100.0 * share);
+            let (mean, min) = (evaluation.mean, evaluation.min);
+            parts.push(format!(
+                "last evaluation: mean {mean:.1}, min {min:.1}, rises {rises:.0} %, stands {stands:.0} %"
+            ));
         }
         let waits = self.waits.current();
         if let Some(wait) = waits.iter().find(|wait| wait.seconds > WAIT_SHOWN) {

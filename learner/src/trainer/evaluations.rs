@@ -53,10 +53,9 @@ impl Trainer {
         };
         let rises = share(|episode| episode.rises);
         let stands = share(|episode| episode.stands);
-        let version = PolicyVersion::from(policy.version.unwrap_or_default());
         let (beta, stage) = (policy.values["beta"], policy.stage);
         let line = EvaluationLine {
-            version: version.to_string(),
+            version: PolicyVersion::from(policy.version.unwrap_or_default()).to_string(),
             env_steps: policy.env_steps,
             updates: evaluation.updates,
             stage,
@@ -90,7 +89,10 @@ impl Trainer {
         self.metrics.evaluation_return_mean.set(mean);
         self.metrics.evaluation_return_min.set(min);
         let env_steps = policy.env_steps;
-        self.evaluation = Some(v1::EvaluationSummary { version: policy.version, env_steps, mean, min, beta });
+        self.metrics.evaluation_rise_rate.set(rises);
+        self.metrics.evaluation_stand_rate.set(stands);
+        let version = policy.version;
+        self.evaluation = Some(v1::EvaluationSummary { version, env_steps, mean, min, beta, rises, stands });
         let result = StageResult { stage, env_steps, min_return: min, mean_return: mean, stand_rate: stands };
         let decision = self.curriculum.report(result, self.progress.env_steps);
         self.decided(decision, evaluation, &line)
