@@ -1,5 +1,5 @@
-//! Updates a second on one core and on two: ours, PyTorch's in eager mode (`peer`: the better of float32 and bfloat16
-//! autocast, and float32 alone), and this update's own matrix products alone (`limit`), in turns in one run.
+//! Updates a second on one core and on two: ours, PyTorch's in eager mode (`peer`: under bfloat16 autocast and in
+//! float32, a row each), and this update's own matrix products alone (`limit`), in turns in one run.
 //!
 //! The peer is `benches/learner_eager.py` under the Python of `cargo xtask setup --peers`.
 
@@ -148,7 +148,7 @@ impl<'a> Side<'a> {
             .args([network.to_string(), width.to_string(), batch.to_string(), threads.to_string()])
             .args([precision.to_string(), TIME.as_secs_f64().to_string()])
             .output()
-            .context("cannot start the peer's Python")?;
+            .context("cannot start the peer's Python: `cargo xtask setup --peers` installs it")?;
         if !output.status.success() {
             bail!("the peer failed: {}", String::from_utf8_lossy(&output.stderr));
         }

@@ -253,6 +253,7 @@ impl Config {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use getup_learner::config::{NetworkKind, Precision};
 
     fn load(arguments: &[&str], environment: &[(&str, &str)]) -> Result<Config> {
         let mut layers = Layers::new()?;
@@ -295,6 +296,14 @@ mod tests {
         assert_eq!((curriculum.n_min, curriculum.n_max), (300_000, 800_000));
         assert_eq!((config.evaluation.every, config.evaluation.episodes), (20_000, 10));
         assert_eq!(config.task, TaskConfig::default());
+        // What the recipes add is off.
+        assert_eq!((sac.network, sac.precision), (NetworkKind::Mlp, Precision::Fp32));
+        assert_eq!(
+            (sac.weight_decay, sac.temperature_floor, sac.lr_steps, sac.critics_first),
+            (0.0, 0.0, 0, 0)
+        );
+        assert_eq!((config.actor.fall_pool, config.actor.noise_hold), (0, 1));
+        assert_eq!((curriculum.high_starts, curriculum.fixed, config.task.fall_ends), (0.0, false, false));
     }
 
     #[test]

@@ -1,10 +1,11 @@
 //! `getup learner`: the learner as a process; and what the one-process trainer shares with it.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
+use getup_learner::checkpoint::Checkpoint;
 use getup_learner::device::{self, Device};
 use getup_learner::hub::Hub;
 use getup_learner::run_folder::{RunFolder, write_atomically};
@@ -33,6 +34,10 @@ pub(crate) struct Args {
     /// The run's folder: checkpoints, models, evaluations. [default: `runs/` and the run's name]
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
+    /// Where its folder holds no checkpoint yet, begin with the actor of this one, a file of another run's checkpoints/,
+    /// and with its critics where they have the configured shape.
+    #[arg(long, value_name = "FILE")]
+    from: Option<PathBuf>,
 }
 
 pub(crate) fn run(arguments: Args) -> Result<()> {
@@ -40,18 +45,28 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let role = Role::new("learner", arguments.role.log_format)?;
     let folder = RunFolder::new(arguments.run.unwrap_or_else(|| PathBuf::from("runs").join(&config.run)));
     let device = device::open(config.learner.device, config.learner.effective_threads())?;
-    role.run(serve(&config, &role, folder, device))
+    role.run(serve(&config, &role, folder, device, arguments.from.as_deref()))
 }
 
-async fn serve(config: &Config, role: &Role, folder: RunFolder, device: Device) -> Result<()> {
+async fn serve(
+    config: &Config,
+    role: &Role,
+    folder: RunFolder,
+    device: Device,
+    from: Option<&Path>,
+) -> Result<()> {
     check_preset(config, &folder)?;
+    let start = match from.map(check_checkpoint).transpose()? {
+        Some(checkpoint) if !folder.has_checkpoint() => Start::Checkpoint(checkpoint),
+        _ => Start::Newest,
+    };
     folder.create()?;
     let (hub, incarnation) = make_hub(config, role, &folder)?;
     let address = &config.network.learner;
     let listener = bind(address, "gRPC").await?;
     tracing::info!("learner serves gRPC at {}", listener.local_addr()?);
     let mut trainer =
-        make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, Start::Newest)?;
+        make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, start)?;
     write_atomically(&folder.config(), config.to_toml()?.as_bytes())?;
     role.serve_metrics(&config.network.learner_metrics).await?;
     let (_reporter, health) = health();
@@ -92,6 +107,12 @@ fn check_preset(config: &Config, folder: &RunFolder) -> Result<()> {
         config.preset
     );
     Ok(())
+}
+
+/// Refuses what is no checkpoint before anything is made for the run.
+pub(crate) fn check_checkpoint(path: &Path) -> Result<&Path> {
+    Checkpoint::load(path).with_context(|| "--from")?;
+    Ok(path)
 }
 
 /// The meeting place of this learner and its actors, and the number of this start of a learner on the run.

@@ -4,9 +4,9 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
-use getup_actor::evaluate::{EvaluatedEpisode, Evaluator, UP_HEIGHT};
+use getup_actor::evaluate::{EvaluatedEpisode, Evaluator};
 use getup_sim::picture::Painter;
-use getup_sim::{Character, TaskConfig};
+use getup_sim::{Character, TaskConfig, UP_HEIGHT};
 
 use crate::evaluate::{Actor, unseen_falls};
 use crate::output::write_file;

@@ -18,7 +18,7 @@ use getup_replay::{LocalSource, ReplayMetrics, Store};
 use getup_telemetry::LogFormat;
 
 use crate::config::{Config, ConfigArgs};
-use crate::learner::{make_hub, make_trainer, sample_options};
+use crate::learner::{check_checkpoint, make_hub, make_trainer, sample_options};
 use crate::links::{HubLink, StoreWriter};
 use crate::role::Role;
 
@@ -61,7 +61,7 @@ pub(crate) struct Args {
 pub(crate) fn run(mut arguments: Args) -> Result<()> {
     let (config, folder) = prepare(&mut arguments)?;
     let start = match (&arguments.from, arguments.resume) {
-        (Some(checkpoint), _) => Start::Checkpoint(checkpoint),
+        (Some(checkpoint), _) => Start::Checkpoint(check_checkpoint(checkpoint)?),
         (None, true) => Start::Newest,
         (None, false) => Start::Untrained,
     };

@@ -154,7 +154,7 @@ fn deterministic_runs_of_one_seed_are_equal_byte_for_byte_and_those_of_another_a
 }
 
 #[test]
-fn a_processor_without_avx512_trains_in_both_precisions() {
+fn with_libtorch_held_to_avx2_training_goes_on_in_both_precisions() {
     let folder = tempfile::tempdir().unwrap();
     for precision in ["fp32", "bf16"] {
         let setting = format!("sac.precision={precision}");
@@ -217,6 +217,8 @@ fn nonsense_is_answered_with_the_thing_the_value_and_the_way_out() {
         (&["--set", "sac.gamma=1.5"], "sac.gamma = 1.5: at least 0 and under 1"),
         (&["--set", "curriculum.n_min=9", "--set", "curriculum.n_max=3"], "at most curriculum.n_max"),
         (&["--resume", "--run", "nowhere"], "there is no run in nowhere"),
+        (&["--from", "nowhere.safetensors"], "cannot read the checkpoint nowhere.safetensors"),
+        (&["--set", "actor.fall_pool=100001"], "actor.fall_pool is 100001: it must be at most 100000"),
         (&["--config", "nowhere.toml"], "cannot read the configuration nowhere.toml"),
         (&["--set", "preset=paper"], "choose it with --preset paper"),
         (&["--set", "sac.uniform_steps=2000000"], "sac.uniform_steps = 2000000: at most replay.capacity"),

@@ -19,7 +19,7 @@ pub struct ActorConfig {
     pub queue_segments: usize,
     /// Whether the limp steps of falls are stored too (Table 1). They never count as env steps.
     pub store_limp: bool,
-    /// Fallen states that are kept to begin episodes from, instead of playing a fall for each; 0 for none.
+    /// Fallen states that each thread keeps to begin episodes from, instead of playing a fall for each; 0 for none.
     pub fall_pool: usize,
     /// Share of the draws from the pool that play a fall after all, and renew a state of it.
     pub fall_renewal: f64,
@@ -56,6 +56,16 @@ pub enum ConfigError {
     /// A number that must be at least 1.
     #[error("actor.{0} is 0: it must be at least 1")]
     Zero(&'static str),
+    /// A number beyond what makes sense.
+    #[error("actor.{name} is {value}: it must be at most {most}")]
+    TooMany {
+        /// Which.
+        name: &'static str,
+        /// Its value.
+        value: usize,
+        /// The most it may be.
+        most: usize,
+    },
     /// A thread without a lane.
     #[error("actor.threads is {threads} and actor.lanes is {lanes}: every thread needs a lane")]
     Threads {
@@ -93,6 +103,10 @@ impl ActorConfig {
         if let Some((name, _)) = counts.into_iter().find(|(_, count)| *count == 0) {
             return Err(ConfigError::Zero(name));
         }
+        let bounded = [("fall_pool", self.fall_pool, 100_000), ("noise_hold", self.noise_hold, 1_000)];
+        if let Some((name, value, most)) = bounded.into_iter().find(|(_, value, most)| value > most) {
+            return Err(ConfigError::TooMany { name, value, most });
+        }
         if self.threads > self.lanes {
             return Err(ConfigError::Threads { threads: self.threads, lanes: self.lanes });
         }
@@ -122,5 +136,8 @@ mod tests {
         assert!(refused(&|c| c.lanes = 0).contains("actor.lanes is 0"));
         assert!(refused(&|c| c.threads = 17).contains("actor.threads is 17 and actor.lanes is 16"));
         assert!(refused(&|c| c.drain_seconds = f64::NAN).contains("actor.drain_seconds is NaN"));
+        assert!(refused(&|c| c.fall_pool = usize::MAX).contains("it must be at most 100000"));
+        assert!(refused(&|c| c.noise_hold = 0).contains("actor.noise_hold is 0"));
+        assert!(refused(&|c| c.fall_renewal = 0.0).contains("actor.fall_renewal is 0"));
     }
 }

@@ -10,13 +10,11 @@ use std::sync::Arc;
 
 use getup_policy::{Forward, Policy, squash};
 use getup_sim::rollout::{DivergedAt, Rollout, RolloutFile};
-use getup_sim::{GetUp, Lane, Phase, SimError, Task, TaskConfig};
+use getup_sim::{GetUp, Lane, Phase, SimError, Task, TaskConfig, UP_HEIGHT};
 use thiserror::Error;
 
 use crate::link::EpisodeResult;
 
-/// The head of a character that is up is at least this high, in metres.
-pub const UP_HEIGHT: f64 = 1.4;
 /// A character stands whose head is up through this many last control steps: 2.5 s.
 pub const STAND_STEPS: usize = 100;
 

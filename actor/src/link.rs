@@ -88,6 +88,14 @@ pub enum UpdateError {
         /// The value, where there is one.
         beta: Option<f64>,
     },
+    /// The share of high starts is none.
+    #[error("policy {version} has {HIGH_STARTS_VALUE} {high_starts}: it must be from 0 to 1")]
+    HighStarts {
+        /// Of the update.
+        version: PolicyVersion,
+        /// As it came.
+        high_starts: f64,
+    },
     /// A lease for something else than falls.
     #[error("lease {id} asks for {scenario:?}: this version of getup evaluates {FALLS_SCENARIO:?}")]
     Scenario {
@@ -124,11 +132,15 @@ impl PolicyUpdate {
             Some(value) if value.is_finite() && value > 0.0 => value,
             _ => return Err(UpdateError::Beta { version, beta }),
         };
+        let high_starts = wire.values.get(HIGH_STARTS_VALUE).copied().unwrap_or(0.0);
+        if !(0.0..=1.0).contains(&high_starts) {
+            return Err(UpdateError::HighStarts { version, high_starts });
+        }
         Ok(Self {
             version,
             policy: Arc::new(policy),
             beta,
-            high_starts: wire.values.get(HIGH_STARTS_VALUE).map_or(0.0, |share| share.clamp(0.0, 1.0)),
+            high_starts,
             values: wire.values.into_iter().collect(),
             stage: wire.stage,
             env_steps: wire.env_steps,

@@ -178,7 +178,7 @@ impl Peer {
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
-            .context("cannot start the peer's Python")?;
+            .context("cannot start the peer's Python: `cargo xtask setup --peers` installs it")?;
         let input = child.stdin.take().expect("it is piped");
         let output = BufReader::new(child.stdout.take().expect("it is piped"));
         Ok(Self { child, input, output })

@@ -38,7 +38,10 @@ pub enum CheckpointError {
         source: std::io::Error,
     },
     /// The file is damaged, or not a checkpoint.
-    #[error("the checkpoint {path} is not usable: {problem}; move it away to resume the one before it")]
+    #[error(
+        "the checkpoint {path} is not usable: {problem}; checkpoints are files of runs/<name>/checkpoints/, and one \
+         that is damaged is moved away to resume the one before it"
+    )]
     Damaged {
         /// The file.
         path: PathBuf,
@@ -58,7 +61,7 @@ pub enum CheckpointError {
     /// The networks of the configuration have another shape.
     #[error(
         "tensor {name:?} of the checkpoint has {found} numbers, the configured networks have {wanted}: resume \
-         with the run's own configuration"
+         with the run's own configuration, or begin with an actor of the configured shape"
     )]
     Shape {
         /// The buffer.

@@ -235,6 +235,13 @@ impl SacConfig {
         check(rate > 0.0 && rate <= 100.0, "sac.updates_per_step", &rate, "over 0, at most 100")
     }
 
+    /// Refuses settings under which nothing is learned by networks that begin untrained.
+    pub fn validate_untrained(&self) -> Result<(), ConfigError> {
+        let known = !self.normalize_observations || self.normalize_until > 0;
+        let wanted = "over 0, unless the run begins with another's networks and statistics (--from)";
+        check(known, "sac.normalize_until", &self.normalize_until, wanted)
+    }
+
     /// What the learning rates of actor and critics are multiplied with at `env_steps` of the run.
     pub fn lr_scale(&self, env_steps: u64) -> f64 {
         if self.lr_steps == 0 {
@@ -289,7 +296,7 @@ pub struct CurriculumConfig {
     pub high_starts: f64,
     /// By how much every such promotion lowers that share.
     pub high_starts_fade: f64,
-    /// Bounds of the env steps that a stage after the first may last.
+    /// Bounds of the env steps that a stage after the discovery may last.
     pub n_min: u64,
     /// See `n_min`.
     pub n_max: u64,
@@ -437,7 +444,12 @@ impl LearnerConfig {
         check(self.threads <= 1024, "learner.threads", &self.threads, "from 0 (automatic) to 1024")?;
         check(self.publish_every > 0, "learner.publish_every", &self.publish_every, "at least 1")?;
         let seconds = self.checkpoint_seconds;
-        check(seconds > 0.0, "learner.checkpoint_seconds", &seconds, "over 0")?;
+        check(
+            seconds > 0.0 && seconds <= 1e6,
+            "learner.checkpoint_seconds",
+            &seconds,
+            "over 0, at most 1000000",
+        )?;
         check(self.checkpoints_kept > 0, "learner.checkpoints_kept", &self.checkpoints_kept, "at least 1")
     }
 

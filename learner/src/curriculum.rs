@@ -91,6 +91,9 @@ pub struct Curriculum {
     stage_limit: Option<u64>,
     /// β of the last stage that passed.
     passed: Option<f64>,
+    /// Stages passed at a β of 1 or less.
+    #[serde(default)]
+    faded: u32,
     /// Of a fixed β.
     #[serde(default)]
     best: Option<Best>,
@@ -117,6 +120,7 @@ impl Curriculum {
             stage_start: 0,
             stage_limit: None,
             passed: None,
+            faded: 0,
             best: None,
             outcome: None,
         }
@@ -149,11 +153,8 @@ impl Curriculum {
 
     /// Share of the episodes that begin high in this stage.
     pub fn high_starts(&self) -> f64 {
-        let CurriculumConfig { beta_start, decay_above_one, high_starts, high_starts_fade, .. } = self.config;
-        // Promotions that lead from `beta_start` down to 1.
-        let above = if beta_start > 1.0 { (-beta_start.ln() / decay_above_one.ln()).ceil() } else { 0.0 };
-        let promotions = (f64::from(self.stage) - above).max(0.0);
-        (high_starts - high_starts_fade * promotions).max(0.0)
+        let CurriculumConfig { high_starts, high_starts_fade, .. } = self.config;
+        (high_starts - high_starts_fade * f64::from(self.faded)).max(0.0)
     }
 
     /// β of the last stage that passed; none before the first promotion.
@@ -206,6 +207,7 @@ impl Curriculum {
     fn pass(&mut self, steps: u64, now: u64) -> Decision {
         let passed = self.beta;
         self.passed = Some(passed);
+        self.faded += u32::from(passed <= 1.0);
         if passed <= self.config.beta_floor {
             return self.finish(Outcome::FloorPassed { beta: passed });
         }
@@ -400,10 +402,11 @@ mod tests {
             start in 0.4..2.0f64,
             floor in 0.1..0.4f64,
             decay in 0.5..0.99f64,
+            decay_above_one in 0.5..0.99f64,
             returns in proptest::collection::vec((0.0..120.0f64, 1u64..200_000, 0u32..3), 1..200),
         ) {
             let config = CurriculumConfig {
-                beta_start: start, beta_floor: floor, decay, ..CurriculumConfig::default()
+                beta_start: start, beta_floor: floor, decay, decay_above_one, ..CurriculumConfig::default()
             };
             let mut curriculum = Curriculum::new(config);
             let mut now = 0;

@@ -83,6 +83,11 @@ impl RunFolder {
         self.root.join("timings.jsonl")
     }
 
+    /// Whether there is something to resume.
+    pub fn has_checkpoint(&self) -> bool {
+        fs::read_dir(self.checkpoints()).is_ok_and(|mut files| files.next().is_some())
+    }
+
     /// Makes the folder and its parts.
     pub fn create(&self) -> Result<(), FolderError> {
         for folder in [self.checkpoints(), self.models()] {

@@ -97,7 +97,17 @@ pub struct Sac {
     pub(crate) rng: ChaCha8Rng,
     pub(crate) updates: u64,
     /// The update for processors, laid out at the first one; see [`Sac::changed`].
-    cpu: Option<CpuUpdate>,
+    cpu: OnCpu,
+}
+
+/// Whether there is an update for this processor.
+enum OnCpu {
+    /// Not asked since the parameters were changed from outside.
+    Unknown,
+    /// Laid out.
+    Ready(Box<CpuUpdate>),
+    /// None: another device, or a processor without the products.
+    Absent,
 }
 
 impl Sac {
@@ -124,13 +134,13 @@ impl Sac {
             critics,
             rng,
             updates: 0,
-            cpu: None,
+            cpu: OnCpu::Unknown,
         }
     }
 
     /// The parameters were changed from outside: whatever was derived from them is made again.
     pub(crate) fn changed(&mut self) {
-        self.cpu = None;
+        self.cpu = OnCpu::Unknown;
     }
 
     /// Updates made so far.
@@ -172,16 +182,14 @@ impl Sac {
         next_noise: &[f32],
         noise: &[f32],
     ) -> Result<Losses, NonFiniteLoss> {
-        if self.cpu.is_none() && self.device == Device::Cpu {
-            self.cpu = self.lay_out();
-        }
-        match self.cpu.take() {
-            Some(mut cpu) => {
+        self.lay_out();
+        match std::mem::replace(&mut self.cpu, OnCpu::Absent) {
+            OnCpu::Ready(mut cpu) => {
                 let losses = self.update_on_cpu(&mut cpu, batch, next_noise, noise);
-                self.cpu = Some(cpu);
+                self.cpu = OnCpu::Ready(cpu);
                 losses
             }
-            None => self.update_by_autograd(batch, next_noise, noise),
+            OnCpu::Unknown | OnCpu::Absent => self.update_by_autograd(batch, next_noise, noise),
         }
     }
 
@@ -284,19 +292,38 @@ impl Sac {
     /// The matrix products of one update on `rows` transitions, at its shapes and in its precision, and nothing else:
     /// what a benchmark holds [`Sac::update`] against. False where the update goes through autograd.
     pub fn multiply(&mut self, rows: usize) -> bool {
-        if self.cpu.is_none() && self.device == Device::Cpu {
-            self.cpu = self.lay_out();
+        self.lay_out();
+        match &mut self.cpu {
+            OnCpu::Ready(cpu) => {
+                cpu.multiply(rows);
+                true
+            }
+            OnCpu::Unknown | OnCpu::Absent => false,
         }
-        self.cpu.as_mut().map(|cpu| cpu.multiply(rows)).is_some()
     }
 
-    fn lay_out(&self) -> Option<CpuUpdate> {
+    /// Lays out the update for processors, where that was not tried yet.
+    fn lay_out(&mut self) {
+        if !matches!(self.cpu, OnCpu::Unknown) {
+            return;
+        }
+        if self.device != Device::Cpu {
+            self.cpu = OnCpu::Absent;
+            return;
+        }
         let [actor, critics, targets] =
             [&self.actor.parameters, &self.critics.parameters, &self.targets.parameters]
                 .map(|parameters| to_vec(parameters.flat()));
         let values = Values { actor: &actor, critics: &critics, targets: &targets };
         let bf16 = self.config.precision.is_bf16();
-        CpuUpdate::new(&self.actor.shape, &self.critics.body, bf16, self.threads, values)
+        let update = CpuUpdate::new(&self.actor.shape, &self.critics.body, bf16, self.threads, values);
+        if update.is_none() {
+            let precision = if bf16 { "bfloat16" } else { "float32" };
+            tracing::warn!(
+                "libtorch has no {precision} products for this processor: updates go through autograd, slowly"
+            );
+        }
+        self.cpu = update.map_or(OnCpu::Absent, |update| OnCpu::Ready(Box::new(update)));
     }
 
     /// The actor as it is now, with the statistics that its observations are normalised by.

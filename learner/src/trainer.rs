@@ -152,6 +152,9 @@ impl Trainer {
             Start::Newest => Checkpoint::newest(&folder.checkpoints())?,
         };
         let is_resumed = resumed.is_some();
+        if !is_resumed && !matches!(start, Start::Checkpoint(_)) {
+            config.sac.validate_untrained()?;
+        }
         if let Some(checkpoint) = resumed {
             checkpoint.restore(&mut sac)?;
             curriculum = checkpoint.curriculum.with_config(config.curriculum.clone());
@@ -181,6 +184,11 @@ impl Trainer {
             if !is_resumed || trainer.progress.evaluation_owed {
                 trainer.offer(policy);
             }
+        }
+        if matches!(start, Start::Checkpoint(_)) {
+            // On disk before the run is one that can be resumed.
+            trainer.checkpoint();
+            trainer.checkpoints.finish()?;
         }
         trainer.show();
         Ok(trainer)

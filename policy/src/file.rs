@@ -73,7 +73,8 @@ struct Header {
 }
 
 impl Policy {
-    /// An untrained policy: orthogonal weights with gain 1, zero biases (App. D).
+    /// An untrained policy: zero biases, and orthogonal weights with gain 1 (App. D); a residual body's blocks and heads as
+    /// SimBa has them.
     pub fn init(shape: PolicyShape, rng: &mut impl Rng) -> Self {
         let mut tensors = BTreeMap::new();
         for (name, _, values) in crate::init::body(&shape.body, shape.observation, rng) {
@@ -147,6 +148,12 @@ impl Policy {
             None => return Err(format(&"it names no version")),
         }
         let header: Header = serde_json::from_value(header).map_err(|error| format(&error))?;
+        if let Some(fault) = header.shape.fault() {
+            return Err(format(&fault));
+        }
+        if let Some(clip) = header.clip.filter(|clip| !(*clip > 0.0)) {
+            return Err(format(&format!("its clip is {clip}, not over 0")));
+        }
         let mut tensors = BTreeMap::new();
         for (name, shape) in header.shape.tensors() {
             tensors.insert(name.clone(), read_tensor(&file, &name, &shape)?);

@@ -54,25 +54,26 @@ impl Body {
     /// Names and shapes of the body's tensors, in order.
     pub fn tensors(&self, inputs: usize) -> Vec<(String, Vec<usize>)> {
         let mut tensors = Vec::new();
-        let mut linear = |name: &str, from: usize, to: usize| {
-            tensors.push((format!("{name}.weight"), if from == 0 { vec![to] } else { vec![to, from] }));
-            tensors.push((format!("{name}.bias"), vec![to]));
+        let mut add = |name: &str, weight: Vec<usize>| {
+            let outputs = weight[0];
+            tensors.push((format!("{name}.weight"), weight));
+            tensors.push((format!("{name}.bias"), vec![outputs]));
         };
         match self {
             Body::Mlp { hidden } => {
                 let widths = std::iter::once(&inputs).chain(hidden);
                 for (index, (from, to)) in widths.zip(hidden).enumerate() {
-                    linear(&format!("body.{index}"), *from, *to);
+                    add(&format!("body.{index}"), vec![*to, *from]);
                 }
             }
             Body::Simba { width, blocks } => {
-                linear("body.embed", inputs, *width);
+                add("body.embed", vec![*width, inputs]);
                 for block in 0..*blocks {
-                    linear(&format!("body.{block}.norm"), 0, *width);
-                    linear(&format!("body.{block}.up"), *width, 4 * width);
-                    linear(&format!("body.{block}.down"), 4 * width, *width);
+                    add(&format!("body.{block}.norm"), vec![*width]);
+                    add(&format!("body.{block}.up"), vec![4 * width, *width]);
+                    add(&format!("body.{block}.down"), vec![*width, 4 * width]);
                 }
-                linear("body.norm", 0, *width);
+                add("body.norm", vec![*width]);
             }
         }
         tensors
@@ -80,6 +81,21 @@ impl Body {
 }
 
 impl PolicyShape {
+    /// What is wrong with a shape that no learner makes, such as one read from a damaged file: a width of 0 or more
+    /// than 16384, or more than 64 layers.
+    pub fn fault(&self) -> Option<String> {
+        let (widths, layers) = match &self.body {
+            Body::Mlp { hidden } => (hidden.clone(), hidden.len()),
+            Body::Simba { width, blocks } => (vec![*width], *blocks),
+        };
+        let mut widths = widths.into_iter().chain([self.observation, self.action]);
+        match widths.find(|width| !(1..=16_384).contains(width)) {
+            Some(width) => Some(format!("its shape has a width of {width}, which is not from 1 to 16384")),
+            None if layers > 64 => Some(format!("its shape has {layers} layers or blocks, more than 64")),
+            None => None,
+        }
+    }
+
     /// Names and shapes of all tensors, in order.
     pub fn tensors(&self) -> Vec<(String, Vec<usize>)> {
         let mut tensors = self.body.tensors(self.observation);

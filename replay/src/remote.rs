@@ -96,6 +96,10 @@ impl MinibatchSource for RemoteSource {
                     self.wait = None;
                     return minibatch.map(Some);
                 }
+                // At a shutdown the task may end between the question above and here.
+                Err(RecvTimeoutError::Disconnected) if self.shutdown.is_triggered() => {
+                    return Err(SampleError::Shutdown);
+                }
                 Err(RecvTimeoutError::Disconnected) => return Err(SampleError::Ended),
                 Err(RecvTimeoutError::Timeout) if left.is_zero() => return Ok(None),
                 Err(RecvTimeoutError::Timeout) => {}

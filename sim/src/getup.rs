@@ -13,9 +13,10 @@ const DROP_HEIGHT: f64 = 1.5;
 /// Head height of a standing character, in metres.
 const STAND_HEIGHT: f64 = 1.55;
 
-/// A head over this was up, in metres…
-const UP_HEIGHT: f64 = 1.4;
-/// …and under this it has fallen.
+/// The head of a character that is up is at least this high, in metres.
+pub const UP_HEIGHT: f64 = 1.4;
+
+/// Once it was up, a head under this has fallen, in metres.
 const DOWN_HEIGHT: f64 = 1.0;
 
 /// The standing pose (the slower stage's target), hinge by hinge, in radians.
@@ -114,6 +115,7 @@ impl GetUp {
     fn stand(&self, world: &World) -> f64 {
         let (margin, value_at_margin, sigmoid) = match self.stand {
             Stand::LongTail => (STAND_HEIGHT / 4.0, 0.2, Sigmoid::LongTail),
+            Stand::Steep => (0.2, 0.2, Sigmoid::LongTail),
             Stand::Gaussian => (0.37, 0.1, Sigmoid::Gaussian),
         };
         tolerance(world.head_height(), [STAND_HEIGHT, f64::INFINITY], margin, value_at_margin, sigmoid)

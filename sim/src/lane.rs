@@ -1,4 +1,5 @@
-//! One character playing episodes of one task: a fall, then control steps until the time limit.
+//! One character playing episodes of one task: a fall or a high start, then control steps until the time limit or a
+//! terminal state.
 //!
 //! A [`Lane`] does nothing by itself: its owner draws β̂, chooses actions and begins the next episode. Stepping
 //! allocates nothing. Everything an episode starts with comes from its seed, and everything after the landing from the

@@ -45,7 +45,7 @@ mod world;
 pub use character::{Character, UnknownCharacter};
 pub use config::{Stand, TaskConfig};
 pub use error::{ConfigError, SimError};
-pub use getup::GetUp;
+pub use getup::{GetUp, UP_HEIGHT};
 pub use lane::{Diverged, Lane, Phase, Step};
 pub use reset::{Fall, Resets, Source, Standing};
 pub use task::Task;

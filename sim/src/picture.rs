@@ -27,6 +27,9 @@ pub enum PictureError {
         "cannot draw offscreen: {0}; install EGL and a driver (Debian: apt-get install libegl1 libgl1-mesa-dri libgles2)"
     )]
     Egl(String),
+    /// The context was there, and drawing failed.
+    #[error("cannot draw: {0}")]
+    Draw(String),
 }
 
 /// Draws poses of one character, all of one size.
@@ -75,7 +78,7 @@ impl Painter {
         (camera.distance, camera.azimuth, camera.elevation) = (DISTANCE, azimuth, ELEVATION);
         self.renderer.set_camera(camera);
         let drawn = self.renderer.sync_data(&mut self.data).and_then(|()| self.renderer.render());
-        drawn.map_err(|error| PictureError::Egl(error.to_string()))?;
+        drawn.map_err(|error| PictureError::Draw(error.to_string()))?;
         Ok(self.renderer.rgb_flat().expect("a renderer draws colours unless told otherwise"))
     }
 }

@@ -13,6 +13,7 @@ use getup_actor::identity::Identity;
 use getup_actor::lanes::{LaneGroup, LaneSettings};
 use getup_actor::link::{Heartbeat, Lease, PolicyUpdate};
 use getup_actor::metrics::ActorMetrics;
+use getup_learner::config::LearnerConfig;
 use getup_learner::device;
 use getup_learner::hub::Hub;
 use getup_learner::run_folder::RunFolder;
@@ -29,6 +30,9 @@ use crate::learner::{make_hub, make_trainer, sample_options};
 use crate::role::Role;
 
 pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_>) -> Result<Ending> {
+    // Sums over threads depend on their number.
+    let learner = LearnerConfig { threads: 1, ..config.learner.clone() };
+    let config = &Config { learner, ..config.clone() };
     let device = device::open(config.learner.device, 1)?;
     folder.create()?;
     let store = open_store(config, role, folder)?;

@@ -63,7 +63,7 @@ pub(crate) fn bench(name: &str) -> Result<()> {
     if !folder.join(format!("{name}.rs")).is_file() {
         let mut known: Vec<String> = std::fs::read_dir(&folder)
             .context("cannot read benches/")?
-            .filter_map(|entry| entry.ok()?.path().file_stem()?.to_str().map(str::to_owned))
+            .filter_map(|entry| entry.ok()?.file_name().to_str()?.strip_suffix(".rs").map(str::to_owned))
             .collect();
         known.sort();
         known.dedup();

@@ -33,6 +33,7 @@ fn bf16(value: f32) -> u32 {
 /// last row pairs with zeros.
 pub(super) fn pack_bf16(values: &[f32], layout: Layout, plain: &mut [u16], pairs: &mut [u32]) {
     let Layout { length, stride } = layout;
+    assert!(values.len() % length == 0 && length <= stride, "rows of {length} in {} numbers", values.len());
     #[cfg(target_arch = "x86_64")]
     let native = is_x86_feature_detected!("avx512bf16") && is_x86_feature_detected!("avx512vl");
     let mut pairs = pairs.chunks_exact_mut(length);
@@ -126,7 +127,8 @@ pub(super) fn transpose(from: &[u32], rows: usize, columns: usize, to: &mut [u32
     transpose_by_words(from, rows, columns, to, 0..rows, 0..columns);
 }
 
-fn transpose_by_words(
+/// The same, word by word, for some rows and columns.
+pub(super) fn transpose_by_words(
     from: &[u32],
     rows: usize,
     columns: usize,

@@ -134,8 +134,8 @@ impl Trainer {
             }
             model.save(self.folder.model("best"))?;
         }
-        if matches!(decision, Decision::Promote { .. } | Decision::Finish(_)) {
-            // On disk before anybody hears of the next stage: the curriculum never goes back.
+        if !matches!(decision, Decision::Ignore | Decision::Stay) {
+            // On disk before anybody hears of the next stage: the curriculum never goes back, nor does its best policy.
             self.checkpoint();
             self.checkpoints.finish()?;
         }
