@@ -93,7 +93,7 @@ class Run:
 
     @property
     def label(self):
-        return f"{self.family}, seed {self.seed}"
+        return f"{self.family}, seed {self.seed}" if self.family != "standing" else self.name
 
     def column(self, field):
         """One field of every evaluation."""

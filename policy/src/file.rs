@@ -151,7 +151,7 @@ impl Policy {
         if let Some(fault) = header.shape.fault() {
             return Err(format(&fault));
         }
-        if let Some(clip) = header.clip.filter(|clip| !(*clip > 0.0)) {
+        if let Some(clip) = header.clip.filter(|clip| clip.is_nan() || *clip <= 0.0) {
             return Err(format(&format!("its clip is {clip}, not over 0")));
         }
         let mut tensors = BTreeMap::new();

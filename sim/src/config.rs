@@ -35,8 +35,6 @@ pub enum Stand {
     /// What the paper's curves come from: margin 1.55 / 4 m, 0.2 at the margin, a long tail. Lying pays 0.0185.
     #[default]
     LongTail,
-    /// For polishing: margin 0.2 m, 0.2 at the margin, a long tail. A crouch that pays 0.79 above pays 0.5 here.
-    Steep,
     /// What the paper's text says: margin 0.37 m, 0.1 at the margin, a Gaussian. Lying pays 1e-14.
     Gaussian,
 }

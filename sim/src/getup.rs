@@ -115,7 +115,6 @@ impl GetUp {
     fn stand(&self, world: &World) -> f64 {
         let (margin, value_at_margin, sigmoid) = match self.stand {
             Stand::LongTail => (STAND_HEIGHT / 4.0, 0.2, Sigmoid::LongTail),
-            Stand::Steep => (0.2, 0.2, Sigmoid::LongTail),
             Stand::Gaussian => (0.37, 0.1, Sigmoid::Gaussian),
         };
         tolerance(world.head_height(), [STAND_HEIGHT, f64::INFINITY], margin, value_at_margin, sigmoid)

@@ -11,7 +11,7 @@
 
 use aligned_vec::{AVec, ConstAlign};
 
-use super::kernels;
+use super::layout;
 
 /// Bytes of a cache line and of the widest vector.
 const ALIGNMENT: usize = 64;
@@ -157,14 +157,14 @@ impl Operand {
 
     /// Rounds `values`, `[F, R]`, into the plain and the paired layout.
     pub(super) fn pack(&mut self, values: &[f32]) {
-        let layout = kernels::Layout { length: self.rows, stride: self.rows };
+        let layout = layout::Layout { length: self.rows, stride: self.rows };
         pack(self.format, values, layout, &mut self.plain, &mut self.pairs);
     }
 
     /// Brings the columns up to date with the plain layout: for the gradient of the weights that read this.
     pub(super) fn transpose(&mut self) {
         let (features, words) = (self.format.padded(self.features), self.rows / self.format.per_word());
-        kernels::transpose(&self.plain, features, words, &mut self.columns);
+        layout::transpose(&self.plain, features, words, &mut self.columns);
     }
 
     /// Width of a row of columns, in words.
@@ -174,7 +174,7 @@ impl Operand {
 }
 
 /// Rounds a matrix into the plain layout (rows of `layout.stride` numbers) and, where there is room, into pairs.
-fn pack(format: Format, values: &[f32], layout: kernels::Layout, plain: &mut [u32], pairs: &mut [u32]) {
+fn pack(format: Format, values: &[f32], layout: layout::Layout, plain: &mut [u32], pairs: &mut [u32]) {
     match format {
         Format::F32 => {
             let words = bytemuck::cast_slice(values);
@@ -183,7 +183,7 @@ fn pack(format: Format, values: &[f32], layout: kernels::Layout, plain: &mut [u3
                 pairs[..words.len()].copy_from_slice(words);
             }
         }
-        Format::Bf16 => kernels::pack_bf16(values, layout, bytemuck::cast_slice_mut(plain), pairs),
+        Format::Bf16 => layout::pack_bf16(values, layout, bytemuck::cast_slice_mut(plain), pairs),
     }
 }
 
@@ -216,11 +216,11 @@ impl Weights {
 
     /// Takes new values, row-major.
     pub(super) fn pack(&mut self, values: &[f32]) {
-        let layout = kernels::Layout { length: self.inputs, stride: self.format.padded(self.inputs) };
+        let layout = layout::Layout { length: self.inputs, stride: self.format.padded(self.inputs) };
         pack(self.format, values, layout, &mut self.plain, &mut self.pairs);
         if !self.transposed.is_empty() {
             let words = self.format.padded(self.outputs) / self.format.per_word();
-            kernels::transpose(&self.pairs, words, self.inputs, &mut self.transposed);
+            layout::transpose(&self.pairs, words, self.inputs, &mut self.transposed);
         }
     }
 

@@ -4,7 +4,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::Device;
 
-use super::kernels;
+use super::layout;
 use super::product::{Format, Operand, Product, Size};
 use crate::config::{NetworkKind, Precision, SacConfig};
 use crate::parameters::to_vec;
@@ -178,7 +178,7 @@ fn words_are_transposed_whatever_the_sides() {
         let words: Vec<u32> = (0..rows * columns).collect();
         let mut turned = vec![0; words.len()];
         let (rows, columns) = (rows as usize, columns as usize);
-        kernels::transpose(&words, rows, columns, &mut turned);
+        layout::transpose(&words, rows, columns, &mut turned);
         for row in 0..rows {
             for column in 0..columns {
                 assert_eq!(turned[column * rows + row], words[row * columns + column], "{rows} × {columns}");
@@ -194,10 +194,10 @@ fn what_is_packed_and_transposed_without_avx512_is_the_same() {
         let mut values = random(rows * columns, -3.0, 3.0, &mut rng);
         values[0] = f32::INFINITY;
         values[columns - 1] = 1.0 + 2.0f32.powi(-9); // Halfway between two numbers of bfloat16.
-        let layout = kernels::Layout { length: columns, stride: columns };
+        let rows_of = layout::Layout { length: columns, stride: columns };
         let (mut plain, mut pairs) =
             (vec![0u16; (rows + 1) * columns], vec![0u32; rows.div_ceil(2) * columns]);
-        kernels::pack_bf16(&values, layout, &mut plain, &mut pairs);
+        layout::pack_bf16(&values, rows_of, &mut plain, &mut pairs);
         let bf16 = |value: f32| {
             let bits = value.to_bits();
             ((bits + 0x7fff + ((bits >> 16) & 1)) >> 16) as u16
@@ -210,8 +210,8 @@ fn what_is_packed_and_transposed_without_avx512_is_the_same() {
         }
         let words: Vec<u32> = values.iter().map(|value| value.to_bits()).collect();
         let (mut fast, mut plain) = (vec![0; words.len()], vec![0; words.len()]);
-        kernels::transpose(&words, rows, columns, &mut fast);
-        kernels::transpose_by_words(&words, rows, columns, &mut plain, 0..rows, 0..columns);
+        layout::transpose(&words, rows, columns, &mut fast);
+        layout::transpose_by_words(&words, rows, columns, &mut plain, 0..rows, 0..columns);
         assert_eq!(fast, plain);
     }
 }

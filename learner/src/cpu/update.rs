@@ -7,8 +7,10 @@ use rayon::ThreadPool;
 use rayon::prelude::*;
 
 use super::kernels::{self, AdamStep, LANES, Motor};
+use super::layout;
 use super::network::{Network, Trace, Ways};
 use super::product::{Aligned, Format, Weights, zeros};
+use super::step::{Flat, cut, take};
 use crate::sac::Batch;
 
 /// Networks laid out for products, and the memory of an update.
@@ -55,13 +57,6 @@ pub(crate) struct Phase {
     pub(crate) loss: f64,
     /// Of the critics: Q of the minibatch's actions. Of the actor: −log π.
     pub(crate) value: f64,
-}
-
-/// The flat buffers of networks and of their optimizer.
-pub(crate) struct Flat<'a> {
-    pub(crate) values: &'a mut [f32],
-    pub(crate) first: &'a mut [f32],
-    pub(crate) second: &'a mut [f32],
 }
 
 impl CpuUpdate {
@@ -200,72 +195,6 @@ impl Phase {
     }
 }
 
-/// The first `length` numbers of `rest`, which keeps the others.
-fn take<'a>(rest: &mut &'a mut [f32], length: usize) -> &'a mut [f32] {
-    let (taken, kept) = std::mem::take(rest).split_at_mut(length);
-    *rest = kept;
-    taken
-}
-
-/// A run of parameters that is updated apart from the others: a linear layer or a norm.
-struct Piece<'a> {
-    flat: Flat<'a>,
-    /// Of every worker.
-    gradients: Vec<&'a mut [f32]>,
-    target: Option<&'a mut [f32]>,
-    /// The number of weights (the rest is bias), their layout, and that of the target's.
-    weights: Option<(usize, &'a mut Weights, Option<&'a mut Weights>)>,
-}
-
-/// Cuts a network into pieces.
-fn cut<'a>(
-    network: &Network,
-    flat: Flat<'a>,
-    mut gradients: Vec<&'a mut [f32]>,
-    weights: &'a mut [Weights],
-    target: Option<(&'a mut [f32], &'a mut Vec<Weights>)>,
-    pieces: &mut Vec<Piece<'a>>,
-) {
-    let Flat { mut values, mut first, mut second } = flat;
-    let mut weights = weights.iter_mut();
-    let (mut targets, target_weights) = target.unzip();
-    let mut target_weights = target_weights.map(|weights| weights.iter_mut());
-    for (range, linear) in network.pieces() {
-        let length = range.len();
-        pieces.push(Piece {
-            flat: Flat {
-                values: take(&mut values, length),
-                first: take(&mut first, length),
-                second: take(&mut second, length),
-            },
-            gradients: gradients.iter_mut().map(|rest| take(rest, length)).collect(),
-            target: targets.as_mut().map(|rest| take(rest, length)),
-            weights: linear.map(|count| {
-                let own = weights.next().expect("one for every linear layer");
-                (count, own, target_weights.as_mut().and_then(Iterator::next))
-            }),
-        });
-    }
-}
-
-impl Piece<'_> {
-    fn step(&mut self, step: AdamStep, tau: f32) {
-        let (sum, others) = self.gradients.split_first_mut().expect("a worker at least");
-        others.iter().for_each(|gradient| kernels::add(sum, gradient));
-        let Flat { values, first, second } = &mut self.flat;
-        kernels::adam(step, values, sum, first, second);
-        if let Some(target) = &mut self.target {
-            kernels::polyak(target, values, tau);
-        }
-        if let Some((count, weights, target_weights)) = &mut self.weights {
-            weights.pack(&values[..*count]);
-            if let (Some(weights), Some(target)) = (target_weights, &self.target) {
-                weights.pack(&target[..*count]);
-            }
-        }
-    }
-}
-
 /// The networks as every worker reads them.
 struct Networks<'a> {
     actor: &'a Network,
@@ -341,7 +270,7 @@ impl Worker {
             staging[..rows.len() * width].copy_from_slice(&from[rows.start * width..rows.end * width]);
             staging[rows.len() * width..padded * width].fill(0.0);
             let words: &[u32] = bytemuck::cast_slice(&staging[..padded * width]);
-            kernels::transpose(words, padded, width, bytemuck::cast_slice_mut(to));
+            layout::transpose(words, padded, width, bytemuck::cast_slice_mut(to));
         };
         load(&batch.observation, observation, &mut self.now[..split]);
         load(&batch.action, action, &mut self.now[split..]);
@@ -391,7 +320,7 @@ impl Worker {
         self.staging[..noise.len()].copy_from_slice(noise);
         self.staging[noise.len()..action * padded].fill(0.0);
         let words: &[u32] = bytemuck::cast_slice(&self.staging[..action * padded]);
-        kernels::transpose(words, padded, action, bytemuck::cast_slice_mut(&mut self.noise));
+        layout::transpose(words, padded, action, bytemuck::cast_slice_mut(&mut self.noise));
 
         let (observations, actions) = self.now.split_at_mut(split);
         actor.forward(networks.values.actor, networks.actor_weights, observations, &mut self.actor);
