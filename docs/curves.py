@@ -326,7 +326,7 @@ def main():
     if mode == ["plot"]:
         plot(runs, ablated)
     else:
-        table(runs)
+        table([run for run in runs if run.family != "standing"])
 
 
 if __name__ == "__main__":
