@@ -1,10 +1,9 @@
-//! The forward pass, in plain Rust on `gemm`: what actors run thousands of times a second.
+//! The forward pass, in plain Rust: what actors run thousands of times a second.
 //!
-//! A batch is worked through in tiles of [`TILE`] rows, the last one padded with zeros. Every row thus goes
-//! through the same arithmetic whatever the batch, so an evaluation gives the same bits on eight lanes as on one.
+//! A batch is worked through in tiles of [`TILE`] rows. Every row goes through the same arithmetic whatever the batch
+//! (see [`Layer`]), so an evaluation gives the same bits on eight lanes as on one.
 
-use gemm::Parallelism;
-
+use crate::layer::Layer;
 use crate::{Body, LOG_STD_MAX, LOG_STD_MIN, NORM_EPSILON, ObservationStatistics, Policy};
 
 /// Rows of one matrix product.
@@ -58,14 +57,6 @@ struct Norm {
     bias: Vec<f32>,
 }
 
-/// A layer whose weights lie `[inputs, outputs]`, so that the product's left factor is contiguous.
-struct Layer {
-    inputs: usize,
-    outputs: usize,
-    weight: Vec<f32>,
-    bias: Vec<f32>,
-}
-
 impl Forward {
     /// Lays out `policy` for batches of up to `max_batch` rows (more are possible, and allocate once).
     pub fn new(policy: &Policy, max_batch: usize) -> Self {
@@ -109,33 +100,32 @@ impl Forward {
             Some(statistics) => statistics.normalize_into(observations, &mut self.front),
             None => self.front[..observations.len()].copy_from_slice(observations),
         }
-        self.front[observations.len()..TILE * self.observation].fill(0.0);
         for step in &self.body {
             match step {
                 Step::Dense(layer, relu) => {
-                    layer.apply(&self.front, &mut self.back, false);
+                    layer.apply(rows, &self.front, &mut self.back, false);
                     if *relu {
-                        self.back[..TILE * layer.outputs].iter_mut().for_each(|x| *x = x.max(0.0));
+                        self.back[..rows * layer.outputs].iter_mut().for_each(|x| *x = x.max(0.0));
                     }
                     std::mem::swap(&mut self.front, &mut self.back);
                 }
                 Step::Block { norm, up, down } => {
-                    norm.apply(&self.front, &mut self.back);
-                    up.apply(&self.back, &mut self.inner, false);
-                    self.inner[..TILE * up.outputs].iter_mut().for_each(|x| *x = x.max(0.0));
-                    down.apply(&self.inner, &mut self.front, true);
+                    norm.apply(rows, &self.front, &mut self.back);
+                    up.apply(rows, &self.back, &mut self.inner, false);
+                    self.inner[..rows * up.outputs].iter_mut().for_each(|x| *x = x.max(0.0));
+                    down.apply(rows, &self.inner, &mut self.front, true);
                 }
                 Step::Norm(norm) => {
-                    norm.apply(&self.front, &mut self.back);
+                    norm.apply(rows, &self.front, &mut self.back);
                     std::mem::swap(&mut self.front, &mut self.back);
                 }
             }
         }
         let heads = &self.heads;
         let outputs = rows * self.action;
-        heads[0].apply(&self.front, &mut self.back, false);
+        heads[0].apply(rows, &self.front, &mut self.back, false);
         self.mean.extend_from_slice(&self.back[..outputs]);
-        heads[1].apply(&self.front, &mut self.back, false);
+        heads[1].apply(rows, &self.front, &mut self.back, false);
         let squashed = |x: &f32| LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (x.tanh() + 1.0);
         self.log_std.extend(self.back[..outputs].iter().map(squashed));
     }
@@ -183,10 +173,10 @@ impl Norm {
     }
 
     /// Normalises the rows of one tile.
-    fn apply(&self, from: &[f32], to: &mut [f32]) {
+    fn apply(&self, rows: usize, from: &[f32], to: &mut [f32]) {
         let width = self.weight.len();
         let scale = 1.0 / width as f32;
-        for (from, to) in from.chunks_exact(width).zip(to.chunks_exact_mut(width)).take(TILE) {
+        for (from, to) in from.chunks_exact(width).zip(to.chunks_exact_mut(width)).take(rows) {
             let mean = sum(from.iter().copied()) * scale;
             let variance = sum(from.iter().map(|x| (x - mean) * (x - mean))) * scale;
             let inverse = 1.0 / (variance + NORM_EPSILON).sqrt();
@@ -203,57 +193,4 @@ fn sum(values: impl ExactSizeIterator<Item = f32>) -> f32 {
     let mut parts = [0.0f32; 16];
     values.enumerate().for_each(|(index, value)| parts[index % 16] += value);
     parts.iter().sum()
-}
-
-impl Layer {
-    fn new(name: &str, inputs: usize, policy: &Policy) -> Self {
-        let weight = policy.tensor(&format!("{name}.weight"));
-        let outputs = weight.len() / inputs;
-        let mut transposed = vec![0.0; weight.len()];
-        for (row, values) in weight.chunks_exact(inputs).enumerate() {
-            for (column, value) in values.iter().enumerate() {
-                transposed[column * outputs + row] = *value;
-            }
-        }
-        let bias = policy.tensor(&format!("{name}.bias")).to_vec();
-        Self { inputs, outputs, weight: transposed, bias }
-    }
-
-    /// `to = from · W + b` for one tile, or `to += from · W + b`: `from` is `[TILE, inputs]`, `to` `[TILE, outputs]`.
-    fn apply(&self, from: &[f32], to: &mut [f32], add: bool) {
-        let (inputs, outputs) = (self.inputs, self.outputs);
-        let from = &from[..TILE * inputs];
-        let to = &mut to[..TILE * outputs];
-        for row in to.chunks_exact_mut(outputs) {
-            match add {
-                true => row.iter_mut().zip(&self.bias).for_each(|(x, bias)| *x += bias),
-                false => row.copy_from_slice(&self.bias),
-            }
-        }
-        // SAFETY: seen as column-major, `to` is outputs × TILE, the weights outputs × inputs, `from` inputs × TILE;
-        // the three slices have exactly these sizes and `to` overlaps neither of the others.
-        unsafe {
-            gemm::gemm(
-                outputs,
-                TILE,
-                inputs,
-                to.as_mut_ptr(),
-                outputs as isize,
-                1,
-                true,
-                self.weight.as_ptr(),
-                outputs as isize,
-                1,
-                from.as_ptr(),
-                inputs as isize,
-                1,
-                1.0,
-                1.0,
-                false,
-                false,
-                false,
-                Parallelism::None,
-            );
-        }
-    }
 }

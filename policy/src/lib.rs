@@ -12,6 +12,7 @@
 mod file;
 mod forward;
 pub mod init;
+mod layer;
 mod shape;
 mod statistics;
 
