@@ -45,8 +45,9 @@ pub enum StoreError {
     },
     /// What was stored cannot be read back whole.
     #[error(
-        "the replay store {dir} is damaged: {what}. Move the folder away to begin with an empty replay (models, \
-         checkpoints and the learner's state lie elsewhere and are not touched)"
+        "the replay store {dir} is damaged: {what}. `getup replay repair {dir}` keeps every whole segment; or move \
+         the folder away to begin with an empty replay (models, checkpoints and the learner's state lie elsewhere \
+         and are not touched)"
     )]
     Damaged {
         /// Where it is.
@@ -62,6 +63,16 @@ pub enum StoreError {
         /// What was attempted, as a verb.
         action: &'static str,
         /// On what.
+        path: PathBuf,
+        /// The system's answer.
+        source: io::Error,
+    },
+    /// The disk has no room. Nothing has changed: the same append works once there is some.
+    #[error(
+        "the replay store cannot write {path}: {source}. Make room on its disk, or lower replay.capacity"
+    )]
+    Full {
+        /// What could not grow.
         path: PathBuf,
         /// The system's answer.
         source: io::Error,

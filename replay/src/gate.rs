@@ -79,7 +79,7 @@ impl Gate {
     }
 
     /// Counts segments that are durable and can be sampled.
-    pub(crate) fn insert(&self, segments: &[Segment]) {
+    pub(crate) fn insert(&self, segments: &[&Segment]) {
         let mut inner = self.lock();
         for segment in segments {
             inner.limiter.insert(u64::from(segment.env_steps));

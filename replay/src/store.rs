@@ -18,8 +18,11 @@ use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment, columns, v1};
 use getup_telemetry::{Shutdown, Waits};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
+use std::thread;
 use std::time::{Duration, Instant};
 
+/// How often a full disk is tried again.
+const FULL_TICK: Duration = Duration::from_millis(250);
 /// How often the disk space is measured, at most.
 const MEASURE_EVERY: Duration = Duration::from_secs(5);
 
@@ -148,15 +151,17 @@ impl Store {
     /// As [`Store::append`]. False if `shutdown` ended the wait: the rest was not appended.
     pub fn append_when_due(&self, segments: Vec<Segment>, shutdown: &Shutdown) -> Result<bool, StoreError> {
         let all: u64 = segments.iter().map(|segment| u64::from(segment.env_steps)).sum();
+        self.check(&segments)?;
         if let Some(_permit) = self.gate.try_admit(all) {
-            self.append(segments)?;
-            return Ok(true);
+            return self.append_when_there_is_room(&segments, shutdown);
         }
         for segment in segments {
             let Some(_permit) = self.gate.admit(u64::from(segment.env_steps), shutdown) else {
                 return Ok(false);
             };
-            self.append(vec![segment])?;
+            if !self.append_when_there_is_room(&[segment], shutdown)? {
+                return Ok(false);
+            }
         }
         Ok(true)
     }
@@ -165,28 +170,59 @@ impl Store {
     /// can be sampled. Those that were stored before are left out. If one is malformed, none is appended.
     ///
     /// # Errors
-    /// [`StoreError::Segment`] if a segment does not follow the spec. Any other error ends all appending:
-    /// what is durable is known when the store is opened again.
+    /// [`StoreError::Segment`] if a segment does not follow the spec, [`StoreError::Full`] if the disk has no room:
+    /// then nothing has changed. Any other error ends all appending: what is durable is known when the store is
+    /// opened again.
     pub fn append(&self, segments: Vec<Segment>) -> Result<(), StoreError> {
-        for segment in &segments {
+        self.check(&segments)?;
+        self.append_checked(&segments)
+    }
+
+    fn check(&self, segments: &[Segment]) -> Result<(), StoreError> {
+        for segment in segments {
             if let Err(error) = segment.check(&self.spec) {
                 self.metrics.reject(error.kind());
                 return Err(error.into());
             }
         }
-        self.append_checked(segments)
+        Ok(())
     }
 
-    /// As [`Store::append`], for segments that were parsed.
-    pub(crate) fn append_checked(&self, segments: Vec<Segment>) -> Result<(), StoreError> {
+    /// As [`Store::append`], for segments that were checked; where the disk is full, waits until it has room.
+    /// False if `shutdown` ended the wait: nothing was appended.
+    pub(crate) fn append_when_there_is_room(
+        &self,
+        segments: &[Segment],
+        shutdown: &Shutdown,
+    ) -> Result<bool, StoreError> {
+        let mut wait = None;
+        loop {
+            let full = match self.append_checked(segments) {
+                Err(error @ StoreError::Full { .. }) => error,
+                result => return result.map(|()| true),
+            };
+            if shutdown.is_triggered() {
+                return Ok(false);
+            }
+            wait.get_or_insert_with(|| {
+                tracing::warn!("{full}");
+                self.waits.begin("replay", full.to_string())
+            });
+            thread::sleep(FULL_TICK);
+        }
+    }
+
+    fn append_checked(&self, segments: &[Segment]) -> Result<(), StoreError> {
         let started = Instant::now();
         if segments.is_empty() {
             return Ok(());
         }
         let wait = self.waits.begin("replay", format!("the disk takes {} segments", segments.len()));
         let mut writing = self.writing();
-        let fresh = writing.log.append(segments)?;
+        let new = writing.log.append(segments)?;
         drop(wait);
+        let fresh: Vec<&Segment> =
+            segments.iter().zip(new).filter_map(|(segment, new)| new.then_some(segment)).collect();
         let state = writing.log.state();
         {
             let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
@@ -196,7 +232,7 @@ impl Store {
             memory.state = state;
             self.metrics.transitions.set(memory.ring.len() as i64);
         }
-        let count = |of: fn(&Segment) -> u64| fresh.iter().map(of).sum::<u64>();
+        let count = |of: fn(&Segment) -> u64| fresh.iter().copied().map(of).sum::<u64>();
         let env_steps = count(|segment| u64::from(segment.env_steps));
         self.gate.insert(&fresh);
 

@@ -1,6 +1,6 @@
 //! `store.json`: which format a store has, whose transitions it holds, and its name.
 //!
-//! It lies beside sled's files, so that any later version can read it before it touches them.
+//! It lies beside the log, so that any later version can read it before it touches that.
 
 use crate::error::StoreError;
 use getup_proto::RunSpec;
@@ -11,7 +11,7 @@ use std::io::Write;
 use std::path::Path;
 
 /// The format that this version reads and writes.
-pub(crate) const FORMAT: u64 = 1;
+pub(crate) const FORMAT: u64 = 2;
 const FILE: &str = "store.json";
 
 /// The content of `store.json`.

@@ -1,24 +1,27 @@
-//! The durable log of segments, over sled: [`Log`].
+//! The durable log of segments: [`Log`].
 //!
-//! A commit is one sled batch in one tree, which is atomic when the process is killed: the segments' pieces, the
-//! marks of their writers, and the totals. Then comes a flush, then the [watermark], and only then the
-//! acknowledgement.
+//! Segments lie in [files] of at most a sixteenth of the capacity, one record after another. A commit is one write at
+//! the end of the newest file: when it returns, the kernel has it, and a process that is killed loses nothing. Then
+//! comes the [watermark], and only then the acknowledgement. When the other files hold the capacity the oldest is
+//! deleted, which gives its space back at once; what only it knew (its writers' marks) goes into the [index]
+//! before.
 //!
-//! Trees are *generations*: each takes a sixteenth of the capacity, and when the others hold the capacity, the
-//! oldest is dropped whole, which costs sled little and gives the disk space back for new ones. The first commit
-//! of a generation repeats all marks, so nothing is lost with those that were dropped.
+//! At start-up everything is read back and checked, against its checksums, against the totals that each file begins
+//! with, and against the watermark.
 //!
-//! At start-up everything is read back and checked, against its checksums and against the watermark.
-//!
-//! - [`record`]: keys and values
+//! - [`record`]: what a file is made of
+//! - [`files`]: where they lie, how they are written and dropped
+//! - [`index`]: what they no longer say, in sled
 //! - [`writers`]: what makes appends idempotent
-//! - [`manifest`], [`watermark`]: two small files beside sled's
+//! - [`manifest`], [`watermark`]: two small files beside them
 //! - [`panics`]: sled's way to report damage
 //! - [`recovery`]: reading it all back
 
+pub(crate) mod files;
+mod index;
 mod manifest;
 mod panics;
-mod record;
+pub(crate) mod record;
 mod recovery;
 mod watermark;
 mod writers;
@@ -28,32 +31,22 @@ pub(crate) use watermark::Watermark;
 
 use crate::config::{ReplayConfig, SyncMode};
 use crate::error::StoreError;
+use files::Tail;
 use getup_proto::{RunSpec, Segment};
+use index::{Content, Index};
 use manifest::Manifest;
-use panics::caught;
-use record::Key;
 use recovery::Recovered;
 use std::collections::VecDeque;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::thread;
 use std::time::{Duration, Instant};
-
 use writers::Writers;
 
-/// Generations that make up the capacity.
-const GENERATIONS: u64 = 16;
-/// sled's page cache. The log is read at start-up alone, so that it only has to hold what is being written.
-const CACHE_BYTES: u64 = 32 << 20;
-/// How often sled moves records out of sparsely filled parts of its file, so that these can be used again.
-const CLEAN_EVERY: Duration = Duration::from_millis(500);
-/// How long to wait for the lock of a store that was just closed in this process.
-const LOCK_PATIENCE: Duration = Duration::from_secs(5);
-/// Begins the name of a generation's tree; its number follows, in 16 hexadecimal digits.
-const TREE_PREFIX: &str = "generation-";
-/// sled's folder in the store's.
-const SLED: &str = "log";
+/// Files that make up the capacity, at least.
+const FILES: u64 = 16;
+/// How long the oldest file stays where the index could not be written.
+const EVICT_AGAIN: Duration = Duration::from_secs(5);
 
 /// The durable log of a store. One thread at a time appends.
 #[derive(Debug)]
@@ -61,29 +54,33 @@ pub(crate) struct Log {
     dir: PathBuf,
     store: u64,
     capacity: u64,
-    /// sled's data file, to be synced before acknowledging; None where the kernel's word is enough.
-    fsync: Option<File>,
-    /// Oldest first; the last takes the commits.
-    generations: VecDeque<Generation>,
-    /// The last generation takes no more commits.
-    full: bool,
+    sync: SyncMode,
+    /// Oldest first; the last one is the tail's, where there is one.
+    files: VecDeque<Held>,
+    /// None before the first commit, and where the newest file is full.
+    tail: Option<Tail>,
     state: State,
     writers: Writers,
+    index: Index,
+    /// Segments whose writers' marks the index has, where these have not come since.
+    indexed: u64,
+    /// No eviction before.
+    evict_at: Instant,
     /// Why there are no more commits.
     failed: Option<String>,
-    db: sled::Db,
+    /// Of the commit that is being put together.
+    records: Vec<u8>,
     /// Shared with those who count samples.
     watermark: Arc<Watermark>,
     /// Holds the store for this process; released after sled.
     _lock: File,
 }
 
-/// One tree of the log.
+/// A file of the log.
 #[derive(Clone, Copy, Debug)]
-struct Generation {
-    number: u64,
+struct Held {
     /// Number in the log of its first segment.
-    first_segment: u64,
+    first: u64,
     transitions: u64,
 }
 
@@ -102,54 +99,73 @@ impl Log {
             Some(manifest) => (manifest, Watermark::open(dir)?),
             None => create(dir, spec)?,
         };
-        let acknowledged = watermark.acknowledged()?;
-        let opened = caught(|| Recovered::read(dir, spec, acknowledged, replay));
-        let (db, recovered) = opened
-            .map_err(|panic| StoreError::damaged(dir, format!("its log is inconsistent ({panic})")))??;
-        let fsync = match config.sync {
-            SyncMode::Process => None,
-            SyncMode::Data => {
-                let path = dir.join(SLED).join("db");
-                Some(File::open(&path).map_err(StoreError::io("open", path))?)
+        for folder in [files::FOLDER, index::FOLDER] {
+            if !dir.join(folder).is_dir() {
+                return Err(StoreError::damaged(dir, format!("its folder `{folder}` is missing")));
             }
-        };
+        }
+        let (index, content) = Index::open(dir, config.sync)?;
+        let recovered = Recovered::read(dir, spec, watermark.acknowledged()?, content, replay)?;
+        let Recovered { files, state, writers, end } = recovered;
         let mut log = Self {
             dir: dir.to_owned(),
             store: manifest.store,
             capacity: config.capacity as u64,
-            fsync,
-            generations: recovered.generations,
-            full: true,
-            state: recovered.state,
-            writers: recovered.writers,
+            sync: config.sync,
+            files,
+            tail: None,
+            state,
+            writers,
+            index,
+            indexed: state.oldest,
+            evict_at: Instant::now(),
             failed: None,
-            db,
+            records: Vec::new(),
             watermark: Arc::new(watermark),
             _lock: lock,
         };
-        log.full = log.generations.back().is_none_or(|newest| log.is_full(newest));
-        log.watermark.set_acknowledged(log.state.segments)?;
+        if let Some(newest) = log.files.back() {
+            log.tail = Some(Tail::open(dir, newest.first, end)?);
+        }
+        log.watermark.set_acknowledged(state.segments)?;
         Ok(log)
     }
 
-    /// Appends the segments that were not stored before, in order, and returns these once they are durable.
+    /// Appends those of the segments that were not stored before, in order. When this returns they are durable;
+    /// it says of each whether it was new.
     ///
-    /// After an error the log takes no more segments: what it holds is seen when it is opened again.
-    pub(crate) fn append(&mut self, segments: Vec<Segment>) -> Result<Vec<Segment>, StoreError> {
+    /// After [`StoreError::Full`] the log is as it was. After any other error it takes no more segments: what it
+    /// holds is seen when it is opened again.
+    pub(crate) fn append(&mut self, segments: &[Segment]) -> Result<Vec<bool>, StoreError> {
         if let Some(reason) = &self.failed {
             return Err(StoreError::Failed(reason.clone()));
         }
-        let before = self.state.segments;
-        let mut fresh = segments;
-        let mut number = before;
-        fresh.retain(|segment| {
-            let new = self.writers.advance(segment.writer, segment.sequence, number);
-            number += u64::from(new);
-            new
-        });
-        if !fresh.is_empty() {
-            self.guarded(|log| log.commit(&fresh))?;
+        let mut state = self.state;
+        let mut writers = self.writers.pending();
+        self.records.clear();
+        let fresh: Vec<bool> = segments
+            .iter()
+            .map(|segment| {
+                let new = writers.advance(segment.writer, segment.sequence, state.segments);
+                if new {
+                    record::put_segment(&mut self.records, state.segments, segment);
+                    state.add(segment);
+                }
+                new
+            })
+            .collect();
+        let moved = writers.moved();
+        if self.records.is_empty() {
+            return Ok(fresh);
         }
+        if let Err(error) = self.commit(state) {
+            if !matches!(error, StoreError::Full { .. }) {
+                self.failed = Some(error.to_string());
+            }
+            return Err(error);
+        }
+        self.writers.accept(moved);
+        self.evict();
         Ok(fresh)
     }
 
@@ -173,93 +189,68 @@ impl Log {
         &self.watermark
     }
 
-    /// Runs what writes; an error or a panic of sled's ends all writing.
-    fn guarded(&mut self, work: impl FnOnce(&mut Self) -> Result<(), StoreError>) -> Result<(), StoreError> {
-        let result = caught(|| work(self))
-            .unwrap_or_else(|panic| Err(StoreError::damaged(&self.dir, format!("its log broke ({panic})"))));
-        if let Err(error) = &result {
-            self.failed = Some(error.to_string());
+    /// Makes the records durable; `state` counts them too.
+    fn commit(&mut self, state: State) -> Result<(), StoreError> {
+        let tail = match &mut self.tail {
+            Some(tail) => tail,
+            None => {
+                let tail = Tail::create(&self.dir, self.state, self.sync)?;
+                self.files.push_back(Held { first: self.state.segments, transitions: 0 });
+                self.tail.insert(tail)
+            }
+        };
+        tail.commit(&self.records, self.sync)?;
+        self.watermark.set_acknowledged(state.segments)?;
+        let newest = self.files.back_mut().expect("the tail is one of them");
+        newest.transitions += state.transitions - self.state.transitions;
+        if newest.transitions >= self.capacity.div_ceil(FILES) || tail.bytes() >= files::FULL_BYTES {
+            self.tail = None;
         }
-        result
+        self.state = state;
+        Ok(())
     }
 
-    fn commit(&mut self, segments: &[Segment]) -> Result<(), StoreError> {
-        let mut batch = sled::Batch::default();
-        if self.full {
-            self.begin_generation(&mut batch);
-        }
-        let mut state = self.state;
-        for segment in segments {
-            record::put_segment(&mut batch, state.segments, segment);
-            state.add(segment);
-        }
-        for segment in segments {
-            let mark = self.writers.get(segment.writer).expect("its mark was just advanced");
-            record::put(&mut batch, Key::Writer(segment.writer), &mark.encode());
-        }
-        let newest = self.generations.back_mut().expect("the first commit begins one");
-        newest.transitions += state.transitions - self.state.transitions;
+    /// Drops the oldest files while the others hold the capacity. An index that cannot be written leaves them
+    /// for a while: nothing is lost by that but space.
+    fn evict(&mut self) {
         let excess = self.excess();
-        state.oldest = self.generations[excess].first_segment;
-        record::put(&mut batch, Key::State, &state.encode());
-        self.write(batch)?;
-        self.watermark.set_acknowledged(state.segments)?;
+        if excess == 0 || Instant::now() < self.evict_at {
+            return;
+        }
+        if let Err(error) = self.drop_files(excess) {
+            tracing::warn!("the oldest segments stay for now: {error}");
+            self.evict_at = Instant::now() + EVICT_AGAIN;
+        }
+    }
 
-        self.state = state;
-        self.full = self.generations.back().is_some_and(|newest| self.is_full(newest));
-        for generation in self.generations.drain(..excess) {
-            self.db.drop_tree(generation.tree_name()).map_err(StoreError::sled(&self.dir))?;
+    fn drop_files(&mut self, excess: usize) -> Result<(), StoreError> {
+        let oldest = self.files[excess].first;
+        let forgotten = self.writers.forget_excess();
+        // Marks that have not moved since are in the index already.
+        let moved = self.writers.iter().filter(|(_, mark)| mark.segment >= self.indexed);
+        self.index.write(&Content { oldest, marks: moved.collect() }, &forgotten)?;
+        (self.state.oldest, self.indexed) = (oldest, self.state.segments);
+        for file in self.files.drain(..excess) {
+            files::remove(&self.dir, file.first)?;
         }
         Ok(())
     }
 
-    /// Makes the batch durable in the newest generation.
-    fn write(&self, batch: sled::Batch) -> Result<(), StoreError> {
-        let newest = self.generations.back().expect("the first commit begins one");
-        let tree = self.db.open_tree(newest.tree_name()).map_err(StoreError::sled(&self.dir))?;
-        tree.apply_batch(batch).map_err(StoreError::sled(&self.dir))?;
-        self.db.flush().map_err(StoreError::sled(&self.dir))?;
-        match &self.fsync {
-            Some(file) => file.sync_data().map_err(StoreError::io("sync", &self.dir)),
-            None => Ok(()),
-        }
-    }
-
-    fn begin_generation(&mut self, batch: &mut sled::Batch) {
-        let number = self.generations.back().map_or(0, |newest| newest.number + 1);
-        let first_segment = self.state.segments;
-        self.generations.push_back(Generation { number, first_segment, transitions: 0 });
-        self.writers.forget_excess();
-        for (writer, mark) in self.writers.iter() {
-            record::put(batch, Key::Writer(writer), &mark.encode());
-        }
-    }
-
-    fn is_full(&self, generation: &Generation) -> bool {
-        generation.transitions >= self.capacity.div_ceil(GENERATIONS)
-    }
-
-    /// How many of the oldest generations can go, as the others hold the capacity.
+    /// How many of the oldest files can go.
     fn excess(&self) -> usize {
-        let mut held: u64 = self.generations.iter().map(|generation| generation.transitions).sum();
-        let fits = |generation: &&Generation| {
-            held -= generation.transitions;
+        let mut held: u64 = self.files.iter().map(|file| file.transitions).sum();
+        let fits = |file: &&Held| {
+            held -= file.transitions;
             held >= self.capacity
         };
-        self.generations.iter().take_while(fits).count()
-    }
-}
-
-impl Generation {
-    fn tree_name(&self) -> String {
-        format!("{TREE_PREFIX}{:016x}", self.number)
+        self.files.iter().take_while(fits).count()
     }
 }
 
 /// Bytes that the store in `dir` takes on disk.
 pub(crate) fn disk_bytes(dir: &Path) -> u64 {
     use std::os::unix::fs::MetadataExt;
-    // sled removes files while we look: one that is gone takes no space.
+    // Files are removed while we look: one that is gone takes no space.
     let Ok(entries) = fs::read_dir(dir) else { return 0 };
     let of = |entry: fs::DirEntry| match entry.metadata() {
         Ok(metadata) if metadata.is_dir() => disk_bytes(&entry.path()),
@@ -281,30 +272,17 @@ fn lock(dir: &Path) -> Result<File, StoreError> {
 
 /// The files of a new store. The manifest comes last: with it, the store is there.
 fn create(dir: &Path, spec: &RunSpec) -> Result<(Manifest, Watermark), StoreError> {
-    if dir.join(SLED).exists() {
-        return Err(StoreError::damaged(dir, "it has a log but no store.json"));
+    let folder = dir.join(files::FOLDER);
+    if folder.is_dir() && !files::list(dir)?.is_empty() {
+        return Err(StoreError::damaged(dir, "it has segments but no store.json"));
+    }
+    for folder in [folder, dir.join(index::FOLDER)] {
+        fs::create_dir_all(&folder).map_err(StoreError::io("create", folder))?;
     }
     let watermark = Watermark::create(dir)?;
     let manifest = Manifest::new(spec);
     manifest.write(dir)?;
     Ok((manifest, watermark))
-}
-
-fn open_sled(dir: &Path) -> Result<sled::Db, StoreError> {
-    let config = sled::Config::new()
-        .path(dir.join(SLED))
-        .cache_capacity(CACHE_BYTES)
-        .flush_every_ms(Some(CLEAN_EVERY.as_millis() as u64));
-    let give_up = Instant::now() + LOCK_PATIENCE;
-    loop {
-        match config.open() {
-            // A store that this process closed keeps sled's lock until sled's threads have let go of it.
-            Err(sled::Error::Io(error)) if error.to_string().contains("lock") && Instant::now() < give_up => {
-                thread::sleep(Duration::from_millis(20));
-            }
-            result => return result.map_err(StoreError::sled(dir)),
-        }
-    }
 }
 
 #[cfg(test)]

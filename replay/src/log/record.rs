@@ -1,38 +1,39 @@
-//! Keys and values of the log.
+//! What a segment file is made of: a header, and then records.
 //!
-//! | key | value |
-//! | --- | --- |
-//! | `n` | [`State`]: totals after the newest commit |
-//! | `s`, segment, piece | a piece of the segment's message |
-//! | `w`, writer | [`Mark`]: how far this writer's segments are durable |
+//! | header | bytes | | record | bytes |
+//! | --- | ---: | --- | --- | ---: |
+//! | `getupseg` | 8 | | `F5` `SEG` | 4 |
+//! | format | 4 | | length of the body | 4 |
+//! | CRC-32 of what follows | 4 | | the segment's number in the log | 8 |
+//! | [`State`] before the file's first segment | 40 | | CRC-32 of length, number and body | 4 |
+//! | | | | the segment's message | |
 //!
-//! Numbers in keys are big-endian, so that keys sort as numbers do. Every value carries a CRC-32 over its key and
-//! itself. A segment is stored as its message, cut into pieces that suit sled: a leaf of up to 16 of them stays
-//! below the size at which sled would put it into a file of its own.
+//! All numbers are little-endian. Each file says by itself where in the log it belongs, and each record where it
+//! begins and whether it is whole: a file that was cut or scribbled over still gives up every whole segment.
 
+use bytes::Bytes;
 use getup_proto::{RunSpec, Segment, v1};
 use prost::Message;
+use std::ops::Range;
 
-/// The longest piece of a segment's message.
-pub(crate) const PIECE_BYTES: usize = 6_400;
-const CRC_BYTES: usize = 4;
-
-/// A key of the log.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) enum Key {
-    State,
-    Piece { segment: u64, piece: u16 },
-    Writer(u64),
-}
+/// The format of the files.
+const FORMAT: u32 = 1;
+const FILE_MAGIC: [u8; 8] = *b"getupseg";
+const RECORD_MAGIC: [u8; 4] = [0xf5, b'S', b'E', b'G'];
+/// Before the first record.
+pub(crate) const HEADER_BYTES: usize = 16 + State::BYTES;
+/// Before a record's body.
+const FRAME_BYTES: usize = 20;
 
 /// Totals over the store's life.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub(crate) struct State {
+    /// Segments ever appended; also the number of the next one.
     pub(crate) segments: u64,
     pub(crate) env_steps: u64,
     pub(crate) transitions: u64,
     pub(crate) episodes: u64,
-    /// Number of the oldest segment that is still kept; older ones may be.
+    /// Number of the oldest segment that is still kept.
     pub(crate) oldest: u64,
 }
 
@@ -45,38 +46,9 @@ pub(crate) struct Mark {
     pub(crate) segment: u64,
 }
 
-impl Key {
-    pub(crate) fn encode(self) -> Vec<u8> {
-        match self {
-            Self::State => vec![b'n'],
-            Self::Piece { segment, piece } => {
-                let mut key = vec![b's'];
-                key.extend(segment.to_be_bytes());
-                key.extend(piece.to_be_bytes());
-                key
-            }
-            Self::Writer(writer) => {
-                let mut key = vec![b'w'];
-                key.extend(writer.to_be_bytes());
-                key
-            }
-        }
-    }
-
-    pub(crate) fn decode(key: &[u8]) -> Option<Self> {
-        match *key {
-            [b'n'] => Some(Self::State),
-            [b's', ref segment @ .., a, b] => {
-                let segment = u64::from_be_bytes(segment.try_into().ok()?);
-                Some(Self::Piece { segment, piece: u16::from_be_bytes([a, b]) })
-            }
-            [b'w', ref writer @ ..] => Some(Self::Writer(u64::from_be_bytes(writer.try_into().ok()?))),
-            _ => None,
-        }
-    }
-}
-
 impl State {
+    const BYTES: usize = 40;
+
     /// Counts a segment that was appended.
     pub(crate) fn add(&mut self, segment: &Segment) {
         self.segments += 1;
@@ -106,39 +78,130 @@ impl Mark {
     }
 }
 
-/// Adds `payload` to the batch under `key`, sealed.
-pub(crate) fn put(batch: &mut sled::Batch, key: Key, payload: &[u8]) {
-    let key = key.encode();
-    let mut value = Vec::with_capacity(CRC_BYTES + payload.len());
-    value.extend(checksum(&key, payload).to_le_bytes());
-    value.extend_from_slice(payload);
-    batch.insert(key, value);
+/// Begins a file whose first segment comes after `before`.
+pub(crate) fn put_header(buffer: &mut Vec<u8>, before: State) {
+    let state = before.encode();
+    buffer.extend(FILE_MAGIC);
+    buffer.extend(FORMAT.to_le_bytes());
+    buffer.extend(crc32fast::hash(&state).to_le_bytes());
+    buffer.extend(state);
 }
 
-/// Adds a segment to the batch, as the log's `number`th.
-pub(crate) fn put_segment(batch: &mut sled::Batch, number: u64, segment: &Segment) {
-    let message = segment.to_wire().encode_to_vec();
-    for (piece, payload) in (0..).zip(message.chunks(PIECE_BYTES)) {
-        put(batch, Key::Piece { segment: number, piece }, payload);
+/// Adds a segment, as the log's `number`th.
+pub(crate) fn put_segment(buffer: &mut Vec<u8>, number: u64, segment: &Segment) {
+    let message = segment.to_wire();
+    let length = message.encoded_len();
+    buffer.reserve(FRAME_BYTES + length);
+    let frame = buffer.len();
+    buffer.extend(RECORD_MAGIC);
+    // A message is far under 4 GB: see `MAX_MESSAGE_BYTES`.
+    buffer.extend((length as u32).to_le_bytes());
+    buffer.extend(number.to_le_bytes());
+    buffer.extend([0; 4]);
+    let body = buffer.len();
+    message.encode(buffer).expect("a vector grows");
+    let crc = checksum(&buffer[frame + 4..frame + 16], &buffer[body..]);
+    buffer[frame + 16..body].copy_from_slice(&crc.to_le_bytes());
+}
+
+/// The totals that a file's header gives; None if it is not whole.
+pub(crate) fn header(file: &[u8]) -> Option<State> {
+    let (magic, rest) = file.split_first_chunk::<8>()?;
+    let (format, rest) = rest.split_first_chunk::<4>()?;
+    let (crc, rest) = rest.split_first_chunk::<4>()?;
+    let (state, _) = rest.split_first_chunk::<{ State::BYTES }>()?;
+    let whole = *magic == FILE_MAGIC
+        && u32::from_le_bytes(*format) == FORMAT
+        && u32::from_le_bytes(*crc) == crc32fast::hash(state);
+    whole.then(|| State::decode(state)).flatten()
+}
+
+/// The records of a file.
+#[derive(Clone, Debug)]
+pub(crate) struct Records {
+    file: Bytes,
+    at: usize,
+}
+
+/// A record that is whole.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub(crate) struct Record {
+    /// Of the segment, in the log.
+    pub(crate) number: u64,
+    /// The segment's message.
+    body: Bytes,
+}
+
+/// Bytes of a file that are no whole record, up to the next one that is, or to the file's end.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub(crate) struct Torn {
+    pub(crate) bytes: Range<usize>,
+}
+
+impl Records {
+    /// Those of a file's content, behind its header.
+    pub(crate) fn new(file: Bytes) -> Self {
+        let at = HEADER_BYTES.min(file.len());
+        Self { file, at }
+    }
+
+    /// Where the next one begins.
+    pub(crate) fn position(&self) -> usize {
+        self.at
+    }
+
+    /// The record at `at`, and where it ends.
+    fn record(&self, at: usize) -> Option<(Record, usize)> {
+        let (frame, rest) = self.file.get(at..)?.split_first_chunk::<FRAME_BYTES>()?;
+        let (magic, fields) = frame.split_first_chunk::<4>()?;
+        let (length, fields) = fields.split_first_chunk::<4>()?;
+        let (number, fields) = fields.split_first_chunk::<8>()?;
+        let length = u32::from_le_bytes(*length) as usize;
+        let body = rest.get(..length)?;
+        let whole = *magic == RECORD_MAGIC && *fields == checksum(&frame[4..16], body).to_le_bytes();
+        let body = at + FRAME_BYTES..at + FRAME_BYTES + length;
+        let end = body.end;
+        whole.then(|| (Record { number: u64::from_le_bytes(*number), body: self.file.slice(body) }, end))
+    }
+
+    /// Where the next whole record begins, from `at` on; the file's length if there is none.
+    fn next_whole(&self, at: usize) -> usize {
+        let windows = self.file.get(at..).unwrap_or_default().windows(RECORD_MAGIC.len());
+        let begins = windows.enumerate().filter(|(_, window)| *window == RECORD_MAGIC);
+        let mut places = begins.map(|(place, _)| at + place);
+        places.find(|&place| self.record(place).is_some()).unwrap_or(self.file.len())
     }
 }
 
-/// What was sealed under `key`; None if either is damaged.
-pub(crate) fn unseal<'a>(key: &[u8], value: &'a [u8]) -> Option<&'a [u8]> {
-    let (crc, payload) = value.split_first_chunk::<CRC_BYTES>()?;
-    (checksum(key, payload) == u32::from_le_bytes(*crc)).then_some(payload)
+impl Iterator for Records {
+    type Item = Result<Record, Torn>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.at >= self.file.len() {
+            return None;
+        }
+        if let Some((record, end)) = self.record(self.at) {
+            self.at = end;
+            return Some(Ok(record));
+        }
+        let from = self.at;
+        self.at = self.next_whole(from + 1);
+        Some(Err(Torn { bytes: from..self.at }))
+    }
 }
 
-/// A segment from its joined pieces, checked as if it had just come in.
-pub(crate) fn segment_from(message: Vec<u8>, spec: &RunSpec) -> Result<Segment, String> {
-    let wire = v1::Segment::decode(bytes::Bytes::from(message)).map_err(|error| error.to_string())?;
-    Segment::parse(wire, spec).map_err(|error| error.to_string())
+impl Record {
+    /// The segment, checked as if it had just come in.
+    pub(crate) fn segment(&self, spec: &RunSpec) -> Result<Segment, String> {
+        let wire = v1::Segment::decode(self.body.clone()).map_err(|error| error.to_string())?;
+        Segment::parse(wire, spec).map_err(|error| error.to_string())
+    }
 }
 
-fn checksum(key: &[u8], payload: &[u8]) -> u32 {
+fn checksum(head: &[u8], body: &[u8]) -> u32 {
     let mut hasher = crc32fast::Hasher::new();
-    hasher.update(key);
-    hasher.update(payload);
+    hasher.update(head);
+    hasher.update(body);
     hasher.finalize()
 }
 
@@ -155,18 +218,39 @@ fn numbers_from_bytes<const N: usize>(bytes: &[u8]) -> Option<[u64; N]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::fixtures;
     use proptest::prelude::*;
 
-    proptest! {
-        #[test]
-        fn keys_survive_and_sort_as_their_numbers_do(a: (u64, u16), b: (u64, u16), writer: u64) {
-            let key = |(segment, piece)| Key::Piece { segment, piece };
-            for key in [key(a), Key::Writer(writer), Key::State] {
-                prop_assert_eq!(Key::decode(&key.encode()), Some(key));
-            }
-            prop_assert_eq!(key(a).encode().cmp(&key(b).encode()), a.cmp(&b));
+    fn file(spec: &RunSpec, segments: u64) -> (Vec<u8>, Vec<usize>) {
+        let mut file = Vec::new();
+        put_header(&mut file, State::default());
+        let mut begins = Vec::new();
+        for number in 0..segments {
+            begins.push(file.len());
+            put_segment(&mut file, number, &fixtures::segment(spec, 1, number + 1, 1 + number as usize % 8));
         }
+        begins.push(file.len());
+        (file, begins)
+    }
 
+    #[test]
+    fn a_whole_file_gives_its_header_and_every_segment() {
+        let spec = fixtures::spec(8);
+        let before = State { segments: 7, env_steps: 40, transitions: 50, episodes: 3, oldest: 2 };
+        let mut bytes = Vec::new();
+        put_header(&mut bytes, before);
+        assert_eq!((header(&bytes), bytes.len()), (Some(before), HEADER_BYTES));
+        let segments: Vec<Segment> = (1..=9).map(|i| fixtures::segment(&spec, 3, i, 8)).collect();
+        for (number, segment) in (7..).zip(&segments) {
+            put_segment(&mut bytes, number, segment);
+        }
+        let read: Vec<Record> = Records::new(bytes.into()).map(Result::unwrap).collect();
+        assert_eq!(read.iter().map(|record| record.number).collect::<Vec<_>>(), (7..16).collect::<Vec<_>>());
+        let parsed: Vec<Segment> = read.iter().map(|record| record.segment(&spec).unwrap()).collect();
+        assert_eq!(parsed, segments);
+    }
+
+    proptest! {
         #[test]
         fn totals_and_marks_survive(numbers: [u64; 5]) {
             let [segments, env_steps, transitions, episodes, oldest] = numbers;
@@ -177,19 +261,40 @@ mod tests {
         }
 
         #[test]
-        fn a_changed_byte_of_key_or_value_is_noticed(
-            payload in prop::collection::vec(any::<u8>(), 0..64),
+        fn damage_costs_the_segments_it_touches_and_no_other(
             place: prop::sample::Index,
+            length in 1usize..400,
             flip in 1u8..,
         ) {
-            let key = Key::Writer(5).encode();
-            let mut value = checksum(&key, &payload).to_le_bytes().to_vec();
-            value.extend(&payload);
-            prop_assert_eq!(unseal(&key, &value), Some(&payload[..]));
-            prop_assert_eq!(unseal(&Key::Writer(6).encode(), &value), None);
-            let place = place.index(value.len());
-            value[place] ^= flip;
-            prop_assert_eq!(unseal(&key, &value), None);
+            let (mut bytes, begins) = file(&fixtures::spec(8), 12);
+            let from = HEADER_BYTES + place.index(bytes.len() - HEADER_BYTES);
+            let to = (from + length).min(bytes.len());
+            bytes[from..to].iter_mut().for_each(|byte| *byte ^= flip);
+            let records: Vec<_> = Records::new(bytes.into()).collect();
+            let whole: Vec<u64> = records.iter().flatten().map(|record| record.number).collect();
+            let untouched = |number: &u64| {
+                let record = begins[*number as usize]..begins[*number as usize + 1];
+                record.end <= from || record.start >= to
+            };
+            prop_assert_eq!(whole, (0..12).filter(untouched).collect::<Vec<_>>());
+            // What is torn is named, and lies where the damage is.
+            let torn: Vec<&Torn> = records.iter().filter_map(|record| record.as_ref().err()).collect();
+            prop_assert!(torn.iter().any(|torn| torn.bytes.start <= from && torn.bytes.end >= to), "{:?}", torn);
+        }
+
+        #[test]
+        fn a_file_cut_anywhere_gives_what_lies_before_the_cut(place: prop::sample::Index) {
+            let (bytes, begins) = file(&fixtures::spec(8), 12);
+            let cut = place.index(bytes.len());
+            let records = Records::new(Bytes::from(bytes).slice(..cut));
+            let whole = records.flatten().count();
+            prop_assert_eq!(whole, begins[1..].iter().filter(|&&end| end <= cut).count());
+        }
+
+        #[test]
+        fn arbitrary_bytes_are_no_segments_and_no_panic(bytes in prop::collection::vec(any::<u8>(), 0..2000)) {
+            prop_assert_eq!(header(&bytes), None);
+            prop_assert_eq!(Records::new(bytes.into()).flatten().count(), 0);
         }
     }
 }

@@ -1,174 +1,126 @@
 //! Reading a log back, and finding out whether it is whole: [`Recovered`].
 
-use super::record::{self, Key, Mark, State};
-use super::{Generation, TREE_PREFIX, Writers, open_sled};
+use super::files;
+use super::index::Content;
+use super::record::{self, Records, State};
+use super::{Held, Writers};
 use crate::error::StoreError;
 use getup_proto::{RunSpec, Segment};
 use std::collections::VecDeque;
-use std::ops::Range;
 use std::path::Path;
-
-/// sled keeps in memory what was read from it, whatever its cache's capacity: after so many bytes it is closed and
-/// opened again.
-const MOST_BYTES_READ: usize = 64 << 20;
 
 /// What a log was found to hold.
 #[derive(Debug, Default)]
-pub(crate) struct Recovered {
+pub(super) struct Recovered {
     /// Oldest first.
-    pub(super) generations: VecDeque<Generation>,
+    pub(super) files: VecDeque<Held>,
     pub(super) state: State,
     pub(super) writers: Writers,
-    /// Numbers of the segments found; None before the first.
-    found: Option<Range<u64>>,
-    /// Since sled was opened.
-    bytes_read: usize,
-}
-
-/// A segment whose pieces are being read.
-struct Partial {
-    number: u64,
-    pieces: u16,
-    message: Vec<u8>,
-}
-
-fn generation_number(tree_name: &[u8]) -> Option<u64> {
-    u64::from_str_radix(str::from_utf8(tree_name).ok()?.strip_prefix(TREE_PREFIX)?, 16).ok()
+    /// Bytes of the newest file that are whole.
+    pub(super) end: u64,
 }
 
 impl Recovered {
-    /// Opens sled, reads all generations, passes their segments to `replay`, and checks that they are all there:
-    /// without a gap, as many as the totals say, and at least as many as were `acknowledged`.
+    /// Reads all files, passes their segments to `replay`, and checks that they are all there: without a gap, as
+    /// the files' headers count them, and at least as many as were `acknowledged`.
+    ///
+    /// What a kill leaves behind is no damage: a last commit that is cut off, which nobody was told of, and a file
+    /// that the index knows to be dropped.
     pub(super) fn read(
         dir: &Path,
         spec: &RunSpec,
         acknowledged: u64,
+        index: Content,
         mut replay: impl FnMut(&Segment),
-    ) -> Result<(sled::Db, Self), StoreError> {
-        let mut db = open_sled(dir)?;
-        let mut numbers: Vec<u64> =
-            db.tree_names().iter().filter_map(|name| generation_number(name)).collect();
-        numbers.sort_unstable();
+    ) -> Result<Self, StoreError> {
         let mut recovered = Self::default();
-        for number in numbers {
-            let mut generation =
-                Generation { number, first_segment: recovered.state.segments, transitions: 0 };
-            let tree = db.open_tree(generation.tree_name()).map_err(StoreError::sled(dir))?;
-            let found = recovered.read_generation(&tree, spec, &mut replay).map_err(|error| match error {
-                Unreadable::Sled(error) => StoreError::sled(dir)(error),
-                Unreadable::Damaged(what) => StoreError::damaged(dir, what),
-            })?;
-            if let Some(transitions) = found {
-                generation.transitions = transitions;
-                recovered.generations.push_back(generation);
-            } else {
-                // Killed between the creation of the tree and its first commit.
-                db.drop_tree(generation.tree_name()).map_err(StoreError::sled(dir))?;
-            }
-            if recovered.bytes_read > MOST_BYTES_READ {
-                recovered.bytes_read = 0;
-                drop((tree, db));
-                db = open_sled(dir)?;
-            }
+        for (writer, mark) in index.marks {
+            recovered.writers.restore(writer, mark);
         }
-        if let (Some(oldest), Some(found)) = (recovered.generations.front_mut(), &recovered.found) {
-            oldest.first_segment = found.start;
+        recovered.state.oldest = index.oldest;
+        let firsts = files::list(dir)?;
+        for &first in firsts.iter().filter(|&&first| first < index.oldest) {
+            files::remove(dir, first)?;
         }
-        recovered.check_whole(acknowledged).map_err(|what| StoreError::damaged(dir, what))?;
-        Ok((db, recovered))
-    }
-
-    fn check_whole(&self, acknowledged: u64) -> Result<(), String> {
-        let State { segments, oldest, .. } = self.state;
-        if segments < acknowledged {
-            return Err(format!(
-                "it acknowledged {acknowledged} segments and holds the first {segments} (a power loss does this \
-                 too, unless replay.sync is \"data\")"
+        let kept: Vec<u64> = firsts.into_iter().filter(|&first| first >= index.oldest).collect();
+        for (place, &first) in kept.iter().enumerate() {
+            let newest = place + 1 == kept.len();
+            recovered.read_file(dir, first, newest, acknowledged, spec, &mut replay)?;
+        }
+        if recovered.state.segments < acknowledged {
+            let segments = recovered.state.segments;
+            return Err(StoreError::damaged(
+                dir,
+                format!(
+                    "it acknowledged {acknowledged} segments and holds the first {segments} (a power loss does \
+                     this too, unless replay.sync is \"data\")"
+                ),
             ));
         }
-        match &self.found {
-            Some(found) if found.start > oldest => {
-                Err(format!("it should begin with segment {oldest} and begins with {}", found.start))
-            }
-            _ => Ok(()),
-        }
+        Ok(recovered)
     }
 
-    /// Reads a generation and returns its transitions; None if it is empty.
-    fn read_generation(
+    fn read_file(
         &mut self,
-        tree: &sled::Tree,
+        dir: &Path,
+        first: u64,
+        newest: bool,
+        acknowledged: u64,
         spec: &RunSpec,
         replay: &mut impl FnMut(&Segment),
-    ) -> Result<Option<u64>, Unreadable> {
-        let mut state = None;
+    ) -> Result<(), StoreError> {
+        let name = || files::path(dir, first).file_name().unwrap_or_default().display().to_string();
+        let damaged = |what: String| StoreError::damaged(dir, format!("{}: {what}", name()));
+        let content = files::read(dir, first)?;
+        let Some(before) = record::header(&content) else {
+            if newest && first >= acknowledged && content.len() < record::HEADER_BYTES {
+                // Killed while it was begun.
+                return files::remove(dir, first);
+            }
+            return Err(damaged("its header cannot be read".to_owned()));
+        };
+        let expected =
+            if self.files.is_empty() { State { oldest: self.state.oldest, ..before } } else { self.state };
+        if self.files.is_empty() && first > self.state.oldest {
+            return Err(damaged(format!("the file of segment {} should come before it", self.state.oldest)));
+        }
+        if first != before.segments || (State { oldest: expected.oldest, ..before }) != expected {
+            return Err(damaged(format!(
+                "it begins after {} segments and {} transitions, and what comes before has {} and {}",
+                before.segments, before.transitions, expected.segments, expected.transitions
+            )));
+        }
+        self.state = expected;
         let mut transitions = 0;
-        let mut partial: Option<Partial> = None;
-        for entry in tree.iter() {
-            let (key, value) = entry.map_err(Unreadable::Sled)?;
-            self.bytes_read += value.len();
-            let decoded = Key::decode(&key).zip(record::unseal(&key, &value));
-            let (key, payload) = decoded.ok_or_else(|| damaged("a record fails its checksum"))?;
-            match key {
-                Key::State => {
-                    state = Some(State::decode(payload).ok_or_else(|| damaged("its totals cannot be read"))?);
+        let mut records = Records::new(content);
+        let mut whole = records.position();
+        while let Some(record) = records.next() {
+            let number = self.state.segments;
+            let record = match record {
+                Ok(record) => record,
+                // Killed while it was written: nothing follows, and nobody was told of it.
+                Err(_) if newest && number >= acknowledged && records.next().is_none() => break,
+                Err(torn) => {
+                    return Err(damaged(format!(
+                        "bytes {} to {} are no whole segment (it should be segment {number})",
+                        torn.bytes.start, torn.bytes.end
+                    )));
                 }
-                Key::Piece { segment, piece } => {
-                    if partial.as_ref().is_some_and(|partial| partial.number != segment) {
-                        transitions += self.finish(partial.take(), spec, replay)?;
-                    }
-                    let partial =
-                        partial.get_or_insert(Partial { number: segment, pieces: 0, message: Vec::new() });
-                    if piece != partial.pieces {
-                        return Err(damaged(format!("segment {segment} lacks a piece")));
-                    }
-                    partial.pieces += 1;
-                    partial.message.extend_from_slice(payload);
-                }
-                Key::Writer(writer) => {
-                    let mark =
-                        Mark::decode(payload).ok_or_else(|| damaged("a writer's mark cannot be read"))?;
-                    self.writers.restore(writer, mark);
-                }
+            };
+            if record.number != number {
+                return Err(damaged(format!("segment {number} is missing: {} follows", record.number)));
             }
+            let segment = record
+                .segment(spec)
+                .map_err(|error| damaged(format!("segment {number} cannot be read ({error})")))?;
+            self.writers.advance(segment.writer, segment.sequence, number);
+            self.state.add(&segment);
+            transitions += segment.steps as u64;
+            whole = records.position();
+            replay(&segment);
         }
-        transitions += self.finish(partial, spec, replay)?;
-        match (state, &self.found) {
-            (None, _) if transitions == 0 => Ok(None),
-            (Some(state), Some(found)) if state.segments == found.end && transitions > 0 => {
-                self.state = state;
-                Ok(Some(transitions))
-            }
-            _ => Err(damaged("its totals and its segments disagree")),
-        }
+        self.files.push_back(Held { first, transitions });
+        self.end = whole as u64;
+        Ok(())
     }
-
-    /// Hands on a segment whose pieces have all come, and returns its transitions.
-    fn finish(
-        &mut self,
-        partial: Option<Partial>,
-        spec: &RunSpec,
-        replay: &mut impl FnMut(&Segment),
-    ) -> Result<u64, Unreadable> {
-        let Some(Partial { number, message, .. }) = partial else { return Ok(0) };
-        let found = self.found.get_or_insert(number..number);
-        if found.end != number {
-            return Err(damaged(format!("segment {} is missing", found.end)));
-        }
-        found.end += 1;
-        let segment = record::segment_from(message, spec)
-            .map_err(|error| damaged(format!("segment {number} cannot be read ({error})")))?;
-        replay(&segment);
-        Ok(segment.steps as u64)
-    }
-}
-
-/// Why a generation cannot be read.
-enum Unreadable {
-    Sled(sled::Error),
-    Damaged(String),
-}
-
-fn damaged(what: impl Into<String>) -> Unreadable {
-    Unreadable::Damaged(what.into())
 }

@@ -1,6 +1,6 @@
 //! `watermark`: how far the log was acknowledged, beside the log.
 //!
-//! sled drops what follows a damaged record without a word. So before an acknowledgement leaves, the number of
+//! A file that ends early looks like one that was written so. So before an acknowledgement leaves, the number of
 //! segments it covers is written here; a log that holds fewer at start-up has lost some. The file also counts the
 //! sampled transitions, which no commit carries. Each write is a few bytes into the kernel's page cache: cheap
 //! enough for every commit and every minibatch, and whole when the process is killed.

@@ -31,6 +31,16 @@ impl Writers {
         new
     }
 
+    /// What these marks become by a commit that may yet fail; [`Writers::accept`] when it has not.
+    pub(crate) fn pending(&self) -> Pending<'_> {
+        Pending { writers: self, moved: Self::default() }
+    }
+
+    /// Takes over the marks that a commit has moved.
+    pub(crate) fn accept(&mut self, moved: Self) {
+        self.marks.extend(moved.marks);
+    }
+
     /// Takes over a mark that was stored.
     pub(crate) fn restore(&mut self, writer: u64, mark: Mark) {
         let known = self.marks.entry(writer).or_insert(mark);
@@ -39,24 +49,39 @@ impl Writers {
         }
     }
 
-    /// The mark of a writer that has one.
-    pub(crate) fn get(&self, writer: u64) -> Option<Mark> {
-        self.marks.get(&writer).copied()
-    }
-
     /// All marks, in no order.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (u64, Mark)> {
         self.marks.iter().map(|(&writer, &mark)| (writer, mark))
     }
 
-    /// Forgets the longest-silent writers beyond [`MOST_WRITERS`].
-    pub(crate) fn forget_excess(&mut self) {
-        if self.marks.len() > MOST_WRITERS {
-            let mut ages: Vec<u64> = self.marks.values().map(|mark| mark.segment).collect();
-            let excess = ages.len() - MOST_WRITERS;
-            let (_, &mut oldest_kept, _) = ages.select_nth_unstable(excess);
-            self.marks.retain(|_, mark| mark.segment >= oldest_kept);
+    /// Forgets the longest-silent writers beyond [`MOST_WRITERS`], and returns them.
+    pub(crate) fn forget_excess(&mut self) -> Vec<u64> {
+        if self.marks.len() <= MOST_WRITERS {
+            return Vec::new();
         }
+        let mut ages: Vec<u64> = self.marks.values().map(|mark| mark.segment).collect();
+        let excess = ages.len() - MOST_WRITERS;
+        let (_, &mut oldest_kept, _) = ages.select_nth_unstable(excess);
+        self.marks.extract_if(|_, mark| mark.segment < oldest_kept).map(|(writer, _)| writer).collect()
+    }
+}
+
+/// Marks before a commit, and those that it moves.
+#[derive(Debug)]
+pub(crate) struct Pending<'a> {
+    writers: &'a Writers,
+    moved: Writers,
+}
+
+impl Pending<'_> {
+    /// As [`Writers::advance`].
+    pub(crate) fn advance(&mut self, writer: u64, sequence: u64, segment: u64) -> bool {
+        sequence > self.writers.durable(writer) && self.moved.advance(writer, sequence, segment)
+    }
+
+    /// The marks that have moved.
+    pub(crate) fn moved(self) -> Writers {
+        self.moved
     }
 }
 
@@ -90,7 +115,9 @@ mod tests {
             writers.advance(writer, 1, writer);
         }
         writers.advance(0, 2, 1 << 40);
-        writers.forget_excess();
+        let mut forgotten = writers.forget_excess();
+        forgotten.sort_unstable();
+        assert_eq!(forgotten, (1..=10).collect::<Vec<_>>());
         assert_eq!(writers.marks.len(), MOST_WRITERS);
         assert_eq!((writers.durable(0), writers.durable(10), writers.durable(11)), (2, 0, 1));
     }

@@ -6,6 +6,7 @@ use crate::error::StoreError;
 use crate::gate::Permit;
 use crate::store::Store;
 use getup_proto::{RunSpec, Segment};
+use getup_telemetry::Shutdown;
 use tokio::sync::{mpsc, oneshot, watch};
 
 /// Segments of a commit, and of the queue, at most.
@@ -27,8 +28,12 @@ pub(super) fn queue_length(spec: &RunSpec) -> usize {
     (MOST_BYTES / longest).clamp(1, MOST_SEGMENTS)
 }
 
-/// Works until all senders of the queue are gone, or an append fails.
-pub(super) fn run(store: &Store, mut queue: mpsc::Receiver<Job>) -> Result<(), StoreError> {
+/// Works until all senders of the queue are gone, an append fails, or `shutdown` finds the disk full.
+pub(super) fn run(
+    store: &Store,
+    mut queue: mpsc::Receiver<Job>,
+    shutdown: &Shutdown,
+) -> Result<(), StoreError> {
     let most = queue_length(store.spec());
     let mut jobs = Vec::with_capacity(most);
     while queue.blocking_recv_many(&mut jobs, most) > 0 {
@@ -47,7 +52,10 @@ pub(super) fn run(store: &Store, mut queue: mpsc::Receiver<Job>) -> Result<(), S
                 }
             }
         }
-        store.append_checked(segments)?;
+        if !store.append_when_there_is_room(&segments, shutdown)? {
+            tracing::warn!("replay ends with {} segments that a full disk did not take", segments.len());
+            return Ok(());
+        }
         for (sequence, permit, durable) in acknowledgements {
             drop(permit);
             durable.send_if_modified(|newest| {

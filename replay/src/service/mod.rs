@@ -58,8 +58,8 @@ pub enum ServeError {
 pub async fn serve(listener: TcpListener, store: Arc<Store>, shutdown: Shutdown) -> Result<(), ServeError> {
     let (jobs, queue) = mpsc::channel(committer::queue_length(store.spec()));
     let committing = {
-        let store = store.clone();
-        tokio::task::spawn_blocking(move || committer::run(&store, queue))
+        let (store, shutdown) = (store.clone(), shutdown.clone());
+        tokio::task::spawn_blocking(move || committer::run(&store, queue, &shutdown))
     };
     let (reporter, health) = health();
     let service = ReplayServer::new(Service { store, jobs, shutdown: shutdown.clone() })
