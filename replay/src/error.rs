@@ -35,6 +35,12 @@ pub enum StoreError {
         /// The one that is read and written here.
         ours: u64,
     },
+    /// There is no store to look at.
+    #[error("there is no replay store in {dir}: name a folder with a store.json, such as runs/NAME/replay")]
+    NoStore {
+        /// Where it should be.
+        dir: PathBuf,
+    },
     /// A process has the store open.
     #[error(
         "the replay store {dir} is in use by another process: end that one, or give this run another folder"

@@ -11,7 +11,7 @@
 //! | module | what it is |
 //! | --- | --- |
 //! | `store` | [`Store`]: the parts below, put together |
-//! | `log` | the durable log over sled: commits, eviction, recovery |
+//! | `log` | the durable log: commits, eviction, recovery, snapshots, repair |
 //! | `ring` | the newest transitions in memory |
 //! | `gather` | from drawn rows to contiguous columns, with n-step returns |
 //! | `sampler` | [`Sampler`]: which transitions are drawn |
@@ -19,10 +19,12 @@
 //! | `gate` | the limiter with its doors: who waits there, and for whom |
 //! | `service` | [`serve`]: the streams of writers and samplers |
 //! | `source`, `remote` | [`MinibatchSource`], in process and over gRPC; [`describe`] |
+//! | `export` | a store's transitions for other tools |
 //! | `minibatch`, `config`, `error`, `metrics` | [`Minibatch`], [`ReplayConfig`], [`StoreError`], [`ReplayMetrics`] |
 
 mod config;
 mod error;
+mod export;
 mod gate;
 mod gather;
 mod limiter;
@@ -42,9 +44,11 @@ mod fixtures;
 
 pub use config::{ConfigError, MAX_CAPACITY, ReplayConfig, SyncMode};
 pub use error::StoreError;
+pub use export::{DatasetId, ExportError, Exported, export_minari, export_npz};
+pub use log::{Ever, Rewritten, Survey, WriterMark, compact, repair, segments};
 pub use metrics::ReplayMetrics;
 pub use minibatch::{MAX_N_STEP, Minibatch, MinibatchColumn, OptionsError, ReplayCounters, SampleOptions};
-pub use remote::{RemoteOptions, RemoteSource, describe};
+pub use remote::{RemoteOptions, RemoteSource, describe, take_snapshot};
 pub use sampler::Sampler;
 pub use service::{ServeError, serve};
 pub use source::{LocalSource, MinibatchSource, SampleError};

@@ -126,6 +126,16 @@ pub async fn describe(endpoint: &str) -> Result<v1::DescribeReply, Status> {
     ask(ReplayClient::new(channel)).await
 }
 
+/// Has the service copy its store to `snapshots/NAME` in its folder.
+///
+/// # Errors
+/// As [`describe`]; INVALID_ARGUMENT if the name is none, FAILED_PRECONDITION if the copy cannot be made.
+pub async fn take_snapshot(endpoint: &str, name: &str) -> Result<v1::SnapshotReply, Status> {
+    let channel = connect(endpoint).await.map_err(|error| Status::unavailable(error.to_string()))?;
+    let request = v1::SnapshotRequest { name: name.to_owned() };
+    ReplayClient::new(channel).snapshot(request).await.map(tonic::Response::into_inner)
+}
+
 async fn ask(mut client: ReplayClient<Channel>) -> Result<v1::DescribeReply, Status> {
     let answer = tokio::time::timeout(CALL_PATIENCE, client.describe(v1::DescribeRequest {})).await;
     answer.map_err(|_| Status::deadline_exceeded("replay does not answer"))?.map(tonic::Response::into_inner)

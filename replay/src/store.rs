@@ -249,6 +249,30 @@ impl Store {
         Ok(())
     }
 
+    /// Copies the store as it is now to the folder `to`, which must not exist and must lie on the same file system:
+    /// a store in itself. Appends wait only while files are linked, sampling not at all; returns for how long they did,
+    /// and the copy's totals.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`]; the store itself goes on.
+    pub fn snapshot(&self, to: &Path) -> Result<(Duration, ReplayCounters), StoreError> {
+        let writing = self.writing();
+        let started = Instant::now();
+        let snapshot = writing.log.begin_snapshot(to);
+        let state = writing.log.state();
+        drop(writing);
+        let paused = started.elapsed();
+        let snapshot = snapshot?;
+        let counters = self.counters_of(state, snapshot.sampled());
+        snapshot.finish(&self.spec)?;
+        Ok((paused, counters))
+    }
+
+    /// Where the store lies.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
     /// Whether minibatches of this kind can be sampled from this store.
     ///
     /// # Errors

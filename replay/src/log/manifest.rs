@@ -21,7 +21,7 @@ pub(crate) struct Manifest {
     format: u64,
     /// Names the store; drawn at its creation, never 0.
     pub(crate) store: u64,
-    spec: RunSpec,
+    pub(crate) spec: RunSpec,
 }
 
 impl Manifest {
@@ -32,6 +32,16 @@ impl Manifest {
 
     /// Of the store in `dir`, where there is one; it must have this format and hold transitions of `spec`.
     pub(crate) fn read(dir: &Path, spec: &RunSpec) -> Result<Option<Self>, StoreError> {
+        let manifest = Self::load(dir)?;
+        if let Some(manifest) = &manifest {
+            spec.check_same(&manifest.spec)
+                .map_err(|source| StoreError::OtherRun { dir: dir.to_owned(), source })?;
+        }
+        Ok(manifest)
+    }
+
+    /// Of the store in `dir`, where there is one, whatever it holds.
+    pub(crate) fn load(dir: &Path) -> Result<Option<Self>, StoreError> {
         let path = dir.join(FILE);
         if !path.try_exists().map_err(StoreError::io("read", &path))? {
             return Ok(None);
@@ -45,10 +55,7 @@ impl Manifest {
             Some(found) => return Err(StoreError::Format { dir: dir.to_owned(), found, ours: FORMAT }),
             None => return Err(StoreError::damaged(dir, format!("{FILE} names no format"))),
         }
-        let manifest: Self = serde_json::from_value(value).map_err(damaged)?;
-        spec.check_same(&manifest.spec)
-            .map_err(|source| StoreError::OtherRun { dir: dir.to_owned(), source })?;
-        Ok(Some(manifest))
+        serde_json::from_value(value).map(Some).map_err(damaged)
     }
 
     /// Writes it under a temporary name, then renames: it is there whole, or not at all.

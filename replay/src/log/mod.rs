@@ -16,6 +16,9 @@
 //! - [`manifest`], [`watermark`]: two small files beside them
 //! - [`panics`]: sled's way to report damage
 //! - [`recovery`]: reading it all back
+//! - [`snapshot`]: a copy while it is written
+//! - [`survey`]: what a store holds, damaged or in use as it may be
+//! - [`rewrite`]: a store from what is whole of another
 
 pub(crate) mod files;
 mod index;
@@ -23,10 +26,15 @@ mod manifest;
 mod panics;
 pub(crate) mod record;
 mod recovery;
+mod rewrite;
+mod snapshot;
+mod survey;
 mod watermark;
 mod writers;
 
 pub(crate) use record::State;
+pub use rewrite::{Rewritten, compact, repair};
+pub use survey::{Ever, Survey, WriterMark, segments};
 pub(crate) use watermark::Watermark;
 
 use crate::config::{ReplayConfig, SyncMode};
@@ -35,6 +43,7 @@ use files::Tail;
 use getup_proto::{RunSpec, Segment};
 use index::{Content, Index};
 use manifest::Manifest;
+use record::Mark;
 use recovery::Recovered;
 use std::collections::VecDeque;
 use std::fs::{self, File};
@@ -43,6 +52,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use writers::Writers;
 
+/// What a log consists of, in its store's folder.
+const FOLDERS: [&str; 3] = [files::FOLDER, index::FOLDER, watermark::FILE];
 /// Files that make up the capacity, at least.
 const FILES: u64 = 16;
 /// How long the oldest file stays where the index could not be written.
@@ -127,6 +138,28 @@ impl Log {
         if let Some(newest) = log.files.back() {
             log.tail = Some(Tail::open(dir, newest.first, end)?);
         }
+        log.watermark.set_acknowledged(state.segments)?;
+        Ok(log)
+    }
+
+    /// A log that goes on behind the totals `state` and knows these marks, in a folder that does not exist.
+    fn begin(
+        dir: &Path,
+        spec: &RunSpec,
+        config: &ReplayConfig,
+        state: State,
+        marks: Vec<(u64, Mark)>,
+    ) -> Result<Self, StoreError> {
+        let mut log = Self::open(dir, spec, config, |_| {})?;
+        log.state = State { oldest: state.segments, ..state };
+        log.indexed = state.segments;
+        for &(writer, mark) in &marks {
+            log.writers.restore(writer, mark);
+        }
+        log.index.write(&Content { oldest: state.segments, marks }, &[])?;
+        // A file of its own keeps the totals where no segment follows.
+        log.tail = Some(Tail::create(dir, log.state, config.sync)?);
+        log.files.push_back(Held { first: state.segments, transitions: 0 });
         log.watermark.set_acknowledged(state.segments)?;
         Ok(log)
     }
@@ -247,17 +280,20 @@ impl Log {
     }
 }
 
-/// Bytes that the store in `dir` takes on disk.
+/// Bytes that the log of the store in `dir` takes on disk. Snapshots, which share most of them, do not count.
 pub(crate) fn disk_bytes(dir: &Path) -> u64 {
+    FOLDERS.iter().map(|name| bytes_in(&dir.join(name))).sum()
+}
+
+fn bytes_in(path: &Path) -> u64 {
     use std::os::unix::fs::MetadataExt;
     // Files are removed while we look: one that is gone takes no space.
-    let Ok(entries) = fs::read_dir(dir) else { return 0 };
-    let of = |entry: fs::DirEntry| match entry.metadata() {
-        Ok(metadata) if metadata.is_dir() => disk_bytes(&entry.path()),
-        Ok(metadata) => metadata.blocks() * 512,
-        Err(_) => 0,
-    };
-    entries.flatten().map(of).sum()
+    let Ok(metadata) = fs::metadata(path) else { return 0 };
+    if !metadata.is_dir() {
+        return metadata.blocks() * 512;
+    }
+    let Ok(entries) = fs::read_dir(path) else { return 0 };
+    entries.flatten().map(|entry| bytes_in(&entry.path())).sum()
 }
 
 fn lock(dir: &Path) -> Result<File, StoreError> {

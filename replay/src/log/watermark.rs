@@ -11,7 +11,7 @@ use std::io;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
-const FILE: &str = "watermark";
+pub(super) const FILE: &str = "watermark";
 /// A number and its CRC-32.
 const RECORD_BYTES: usize = 12;
 /// Places of the records, each in a disk sector of its own.

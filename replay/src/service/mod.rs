@@ -18,7 +18,7 @@ use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, SpecError, v1};
 use getup_telemetry::Shutdown;
 use getup_telemetry::health::{ServingStatus, health};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -33,6 +33,8 @@ const HELLO_PATIENCE: Duration = Duration::from_secs(10);
 const PING_EVERY: Duration = Duration::from_secs(10);
 /// Bytes of a stream that may be on their way to a server that is not reading: some tens of segments.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
+/// Where snapshots go, in the store's folder.
+const SNAPSHOTS: &str = "snapshots";
 /// Replies that may wait for a client that is not reading.
 const REPLIES: usize = 2;
 
@@ -154,6 +156,35 @@ impl Replay for Service {
         let store = self.store.clone();
         let described = tokio::task::spawn_blocking(move || store.describe()).await;
         described.map(Response::new).map_err(|error| Status::internal(error.to_string()))
+    }
+
+    async fn snapshot(
+        &self,
+        request: Request<v1::SnapshotRequest>,
+    ) -> Result<Response<v1::SnapshotReply>, Status> {
+        let name = request.into_inner().name;
+        let allowed = |character: char| character.is_ascii_alphanumeric() || "-_.".contains(character);
+        if name.is_empty() || name.len() > 100 || name.starts_with('.') || !name.chars().all(allowed) {
+            return Err(Status::invalid_argument(format!(
+                "{name:?} is no snapshot's name: take up to 100 letters, digits, `-`, `_` and `.`, and no `.` first"
+            )));
+        }
+        let store = self.store.clone();
+        let taken = tokio::task::spawn_blocking(move || {
+            let started = Instant::now();
+            let path = store.dir().join(SNAPSHOTS).join(&name);
+            let (paused, counters) = store.snapshot(&path)?;
+            Ok::<_, StoreError>(v1::SnapshotReply {
+                path: path.display().to_string(),
+                paused_seconds: paused.as_secs_f64(),
+                seconds: started.elapsed().as_secs_f64(),
+                counters: Some(counters.into()),
+            })
+        });
+        match taken.await.map_err(|error| Status::internal(error.to_string()))? {
+            Ok(reply) => Ok(Response::new(reply)),
+            Err(error) => Err(Status::failed_precondition(error.to_string())),
+        }
     }
 }
 

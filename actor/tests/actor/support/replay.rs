@@ -7,7 +7,8 @@ use std::sync::{Arc, Mutex};
 use getup_proto::v1::append_request::Message;
 use getup_proto::v1::replay_server::{Replay, ReplayServer};
 use getup_proto::v1::{
-    AppendReply, AppendRequest, DescribeReply, DescribeRequest, SampleReply, SampleRequest,
+    AppendReply, AppendRequest, DescribeReply, DescribeRequest, SampleReply, SampleRequest, SnapshotReply,
+    SnapshotRequest,
 };
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment};
 use tokio_stream::{Stream, StreamExt};
@@ -114,6 +115,10 @@ impl Replay for Store {
     }
 
     async fn describe(&self, _: Request<DescribeRequest>) -> Result<Response<DescribeReply>, Status> {
+        Err(Status::unimplemented("this replay only stores"))
+    }
+
+    async fn snapshot(&self, _: Request<SnapshotRequest>) -> Result<Response<SnapshotReply>, Status> {
         Err(Status::unimplemented("this replay only stores"))
     }
 }

@@ -1,4 +1,6 @@
-//! `getup replay`: the replay as a process.
+//! `getup replay`: the replay as a process, and tools for its store ([`tools`]).
+
+mod tools;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -10,8 +12,13 @@ use crate::config::Config;
 use crate::role::{Role, RoleArgs, bind};
 
 /// Run the replay: stores what actors push, durably, and serves minibatches to the learner.
+///
+/// With a subcommand: look at a store, mend it, copy it, or take its transitions elsewhere.
 #[derive(clap::Args)]
+#[command(args_conflicts_with_subcommands = true)]
 pub(crate) struct Args {
+    #[command(subcommand)]
+    tool: Option<tools::Tool>,
     #[command(flatten)]
     role: RoleArgs,
     /// The store's folder. [default: `replay` in the run's folder]
@@ -20,6 +27,9 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(arguments: Args) -> Result<()> {
+    if let Some(tool) = arguments.tool {
+        return tool.run();
+    }
     let config = arguments.role.config.load()?;
     let role = Role::new("replay", arguments.role.log_format)?;
     let dir = arguments.dir.unwrap_or_else(|| PathBuf::from("runs").join(&config.run).join("replay"));

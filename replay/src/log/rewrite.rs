@@ -1,0 +1,180 @@
+//! Writing a store anew from what is whole of it: [`repair`] and [`compact`].
+
+use super::survey::{Found, Survey};
+use super::{FOLDERS, Log, State, lock};
+use crate::config::ReplayConfig;
+use crate::error::StoreError;
+use getup_proto::Segment;
+use serde::Serialize;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Where the new log is put together.
+const UNFINISHED: &str = "rewriting";
+/// Segments that are written at once.
+const GROUP: usize = 64;
+
+/// What a store was before and is now.
+#[derive(Clone, PartialEq, Debug, Serialize)]
+pub struct Rewritten {
+    /// What was found, its damages too.
+    pub found: Survey,
+    /// Segments that were kept.
+    pub segments: u64,
+    /// Their transitions.
+    pub transitions: u64,
+    /// Where the old files lie; none where there was no need to keep them.
+    pub old: Option<PathBuf>,
+}
+
+/// Keeps every whole segment of the damaged store in `dir`, each once. The files as they were are moved to
+/// `damaged-N/` in it. A store that is whole is left as it is.
+///
+/// # Errors
+/// [`StoreError`] if it is in use, or is no store; nothing has changed then.
+pub fn repair(dir: &Path) -> Result<Rewritten, StoreError> {
+    // The lock is let go before the survey, which takes it for a moment: the index can be read by one alone.
+    drop(lock(dir)?);
+    let found = Found::read(dir, |_, _| {})?;
+    let _lock = lock(dir)?;
+    if found.survey.damages.is_empty() {
+        let (segments, transitions) = (found.survey.segments, found.survey.transitions);
+        return Ok(Rewritten { found: found.survey, segments, transitions, old: None });
+    }
+    let (segments, transitions) = rewrite(dir, &found, 0)?;
+    let old = (1..).map(|n| dir.join(format!("damaged-{n}"))).find(|path| !path.exists());
+    let old = old.expect("there is a name left");
+    fs::create_dir(&old).map_err(StoreError::io("create", &old))?;
+    swap(dir, Some(&old))?;
+    Ok(Rewritten { found: found.survey, segments, transitions, old: Some(old) })
+}
+
+/// Writes the store in `dir` anew with its newest `keep` transitions alone (whole segments, and not fewer), or with
+/// all of them.
+///
+/// # Errors
+/// [`StoreError`] if it is in use, damaged, or no store; nothing has changed then.
+pub fn compact(dir: &Path, keep: Option<u64>) -> Result<Rewritten, StoreError> {
+    drop(lock(dir)?);
+    let found = Found::read(dir, |_, _| {})?;
+    let _lock = lock(dir)?;
+    if let Some(damage) = found.survey.damages.first() {
+        return Err(StoreError::damaged(dir, damage));
+    }
+    let excess = keep.map_or(0, |keep| found.survey.transitions.saturating_sub(keep));
+    let (segments, transitions) = rewrite(dir, &found, excess)?;
+    swap(dir, None)?;
+    Ok(Rewritten { found: found.survey, segments, transitions, old: None })
+}
+
+/// Puts a new log together, without the oldest segments that make up to `excess` transitions; returns its segments
+/// and transitions.
+fn rewrite(dir: &Path, found: &Found, excess: u64) -> Result<(u64, u64), StoreError> {
+    let unfinished = dir.join(UNFINISHED);
+    if unfinished.exists() {
+        fs::remove_dir_all(&unfinished).map_err(StoreError::io("remove", &unfinished))?;
+    }
+    // Nothing may be evicted from it.
+    let config = ReplayConfig { capacity: crate::MAX_CAPACITY, ..ReplayConfig::default() };
+    let mut writing = Writing {
+        dir: unfinished,
+        found,
+        config,
+        excess,
+        log: None,
+        group: Vec::new(),
+        state: State::default(),
+        error: None,
+    };
+    Found::read(dir, |before, segment| writing.take(before, segment))?;
+    writing.finish()
+}
+
+struct Writing<'a> {
+    dir: PathBuf,
+    found: &'a Found,
+    config: ReplayConfig,
+    /// Transitions that are still to be left out.
+    excess: u64,
+    log: Option<Log>,
+    group: Vec<Segment>,
+    /// After what was left out.
+    state: State,
+    error: Option<StoreError>,
+}
+
+impl Writing<'_> {
+    fn take(&mut self, before: State, segment: Segment) {
+        if self.error.is_some() {
+            return;
+        }
+        if self.log.is_none() {
+            if segment.steps as u64 <= self.excess {
+                self.excess -= segment.steps as u64;
+                return;
+            }
+            self.error = self.begin(before).err();
+        }
+        self.group.push(segment);
+        if self.group.len() == GROUP {
+            self.write();
+        }
+    }
+
+    /// Begins the log behind the totals `before`; the marks of writers whose segments are gone come along.
+    fn begin(&mut self, before: State) -> Result<(), StoreError> {
+        let marks = self.found.writers.iter().filter(|(_, mark)| mark.segment < before.segments);
+        let log = Log::begin(&self.dir, &self.found.survey.spec, &self.config, before, marks.collect())?;
+        if let Some(sampled) = self.found.survey.sampled {
+            log.watermark().set_sampled(sampled)?;
+        }
+        self.state = log.state();
+        self.log = Some(log);
+        Ok(())
+    }
+
+    fn write(&mut self) {
+        let group = std::mem::take(&mut self.group);
+        if let (Some(log), None) = (&mut self.log, &self.error) {
+            self.error = log.append(&group).err();
+        }
+    }
+
+    fn finish(mut self) -> Result<(u64, u64), StoreError> {
+        self.write();
+        if self.log.is_none() && self.error.is_none() {
+            // Nothing is left, and the totals are not forgotten.
+            let totals = self.found.end;
+            self.error = self.begin(totals).err();
+        }
+        match (self.error, self.log) {
+            (None, Some(log)) => {
+                let State { segments, transitions, .. } = log.state();
+                Ok((segments - self.state.segments, transitions - self.state.transitions))
+            }
+            (Some(error), _) => Err(error),
+            (None, None) => unreachable!("the log was begun"),
+        }
+    }
+}
+
+/// Puts the new log in the old one's place, and that to `aside`, or away.
+fn swap(dir: &Path, aside: Option<&Path>) -> Result<(), StoreError> {
+    let unfinished = dir.join(UNFINISHED);
+    let replaced = aside.map_or_else(|| dir.join("replaced"), Path::to_owned);
+    if aside.is_none() {
+        fs::create_dir(&replaced).map_err(StoreError::io("create", &replaced))?;
+    }
+    for name in FOLDERS {
+        let (old, new) = (dir.join(name), unfinished.join(name));
+        if old.exists() {
+            fs::rename(&old, replaced.join(name)).map_err(StoreError::io("move", &old))?;
+        }
+        fs::rename(&new, &old).map_err(StoreError::io("move", &new))?;
+    }
+    fs::remove_dir_all(&unfinished).map_err(StoreError::io("remove", &unfinished))?;
+    if aside.is_none() {
+        fs::remove_dir_all(&replaced).map_err(StoreError::io("remove", &replaced))?;
+    }
+    Ok(())
+}

@@ -1,0 +1,97 @@
+//! A copy of a store that is being written: [`Snapshot`].
+//!
+//! Files that are full never change, so the copy shares them (hard links). Of the newest file what is committed never
+//! changes either: only links and marks are taken while appends wait; the rest is copied afterwards.
+
+use super::files::{self, Tail};
+use super::index::{Content, Index};
+use super::manifest::Manifest;
+use super::record::Mark;
+use super::watermark::Watermark;
+use super::{Log, State};
+use crate::config::SyncMode;
+use crate::error::StoreError;
+use getup_proto::RunSpec;
+use std::fs::{self, File};
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+
+/// A snapshot that has begun; [`Snapshot::finish`] when appends go on.
+#[derive(Debug)]
+pub(crate) struct Snapshot {
+    /// Where it is put together, and where it goes then.
+    unfinished: PathBuf,
+    dir: PathBuf,
+    state: State,
+    marks: Vec<(u64, Mark)>,
+    sampled: u64,
+    /// The newest file, and how many bytes of it count.
+    tail: Option<(u64, File, u64)>,
+}
+
+impl Log {
+    /// Takes what must be of one moment. `dir` must not exist, and lie on the store's file system.
+    pub(crate) fn begin_snapshot(&self, dir: &Path) -> Result<Snapshot, StoreError> {
+        if dir.exists() {
+            let exists = io::Error::from(io::ErrorKind::AlreadyExists);
+            return Err(StoreError::io("create", dir)(exists));
+        }
+        let unfinished = dir.with_extension("unfinished");
+        if unfinished.exists() {
+            fs::remove_dir_all(&unfinished).map_err(StoreError::io("remove", &unfinished))?;
+        }
+        let segments = unfinished.join(files::FOLDER);
+        fs::create_dir_all(&segments).map_err(StoreError::io("create", &segments))?;
+        let open = self.tail.is_some();
+        let full = self.files.len() - usize::from(open);
+        for file in self.files.iter().take(full) {
+            let (from, to) = (files::path(&self.dir, file.first), files::path(&unfinished, file.first));
+            fs::hard_link(&from, &to).map_err(StoreError::io("link", from))?;
+        }
+        let tail = self.tail.as_ref().zip(self.files.back());
+        let read = |(tail, held): (&Tail, &super::Held)| {
+            Ok::<_, StoreError>((held.first, tail.reader()?, tail.bytes()))
+        };
+        let tail = tail.map(read).transpose()?;
+        Ok(Snapshot {
+            unfinished,
+            dir: dir.to_owned(),
+            state: self.state,
+            marks: self.writers.iter().collect(),
+            sampled: self.watermark.sampled()?,
+            tail,
+        })
+    }
+}
+
+impl Snapshot {
+    /// Transitions that were sampled before it.
+    pub(crate) fn sampled(&self) -> u64 {
+        self.sampled
+    }
+
+    /// Copies the rest, and gives the snapshot its name: it is there whole, or not at all.
+    pub(crate) fn finish(self, spec: &RunSpec) -> Result<(), StoreError> {
+        let Self { unfinished, dir, state, marks, sampled, tail } = self;
+        if let Some((first, file, bytes)) = tail {
+            let to = files::path(&unfinished, first);
+            let copy = || io::copy(&mut file.take(bytes), &mut File::create_new(&to)?);
+            copy().map_err(StoreError::io("write", &to))?;
+        }
+        let (mut index, _) = Index::open(&unfinished, SyncMode::Data)?;
+        index.write(&Content { oldest: state.oldest, marks }, &[])?;
+        drop(index);
+        let watermark = Watermark::create(&unfinished)?;
+        watermark.set_acknowledged(state.segments)?;
+        watermark.set_sampled(sampled)?;
+        Manifest::new(spec).write(&unfinished)?;
+        fs::rename(&unfinished, &dir).map_err(StoreError::io("move", &dir))
+    }
+}
+
+impl Tail {
+    /// Another handle, to read what is committed: it stays readable when the file is dropped.
+    fn reader(&self) -> Result<File, StoreError> {
+        File::open(self.path()).map_err(StoreError::io("open", self.path()))
+    }
+}
