@@ -171,7 +171,12 @@ pub(crate) struct Peer {
 
 impl Peer {
     pub(crate) fn start(script: &str, arguments: &[&str]) -> anyhow::Result<Self> {
-        let python = std::env::var("GETUP_PEERS_PYTHON").context("run it as `cargo xtask bench NAME`")?;
+        Self::start_with("GETUP_PEERS_PYTHON", script, arguments)
+    }
+
+    /// As [`Peer::start`], under the Python that this variable names.
+    pub(crate) fn start_with(variable: &str, script: &str, arguments: &[&str]) -> anyhow::Result<Self> {
+        let python = std::env::var(variable).context("run it as `cargo xtask bench NAME`")?;
         let mut child = Command::new(python)
             .arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("benches").join(script))
             .args(arguments)
@@ -185,10 +190,16 @@ impl Peer {
     }
 
     /// What it answers to a line.
-    pub(crate) fn ask(&mut self, line: &str) -> anyhow::Result<f64> {
+    pub(crate) fn ask_line(&mut self, line: &str) -> anyhow::Result<String> {
         writeln!(self.input, "{line}").context("the peer has ended")?;
         let mut answer = String::new();
         self.output.read_line(&mut answer).context("the peer has ended")?;
+        Ok(answer)
+    }
+
+    /// The number that it answers to a line.
+    pub(crate) fn ask(&mut self, line: &str) -> anyhow::Result<f64> {
+        let answer = self.ask_line(line)?;
         answer
             .trim()
             .parse::<f64>()

@@ -35,6 +35,9 @@ const CUDA_WHEELS: &[&str] = &[
 ];
 /// What benchmarks compare with: PyTorch whole, with NumPy for its tensors.
 const PEER_REQUIREMENTS: &[&str] = &["torch==2.11.0", "numpy==2.3.5"];
+/// What `benches/replay.rs` compares with, in an environment of its own: it needs an older NumPy.
+const REVERB_REQUIREMENTS: &[&str] =
+    &["dm-reverb[tensorflow]==0.14.0", "tensorflow==2.15.1", "numpy==1.26.4"];
 /// What `docs/curves.py` draws with; tomli reads TOML where Python does not yet.
 const PLOT_REQUIREMENTS: &[&str] = &["matplotlib==3.10.9", "tomli==2.5.0; python_version < '3.11'"];
 
@@ -49,6 +52,11 @@ pub(crate) fn root() -> PathBuf {
 
 fn native() -> PathBuf {
     root().join(".native")
+}
+
+/// The Python of Reverb's environment.
+pub(crate) fn reverb_python() -> PathBuf {
+    native().join("peers-reverb/bin/python")
 }
 
 /// The Python of the peers' environment.
@@ -79,7 +87,8 @@ pub(crate) fn set_up(cuda: bool) -> Result<()> {
 
 /// Makes the environment that the benchmarks' peers run in.
 pub(crate) fn set_up_peers() -> Result<()> {
-    set_up_environment("peers", &peers_python(), PEER_REQUIREMENTS, "the benchmarks' peers")
+    set_up_environment("peers", &peers_python(), PEER_REQUIREMENTS, "the benchmarks' peers")?;
+    set_up_environment("peers-reverb", &reverb_python(), REVERB_REQUIREMENTS, "Reverb, a peer of benchmarks")
 }
 
 /// Makes the environment that figures are drawn in.

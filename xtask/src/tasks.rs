@@ -5,7 +5,7 @@ use std::process::Command;
 
 use anyhow::{Context, Result, bail};
 
-use crate::native::{self, peers_python, root, run};
+use crate::native::{self, peers_python, reverb_python, root, run};
 
 fn cargo() -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
@@ -71,5 +71,6 @@ pub(crate) fn bench(name: &str) -> Result<()> {
     }
     run(cargo()
         .args(["bench", "--package", "getup", "--bench", name])
-        .env("GETUP_PEERS_PYTHON", peers_python()))
+        .env("GETUP_PEERS_PYTHON", peers_python())
+        .env("GETUP_REVERB_PYTHON", reverb_python()))
 }
