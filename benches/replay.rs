@@ -301,10 +301,13 @@ fn insert(runtime: &Runtime, writers: u64, sync: &str) -> Result<(f64, [f64; 2])
             transitions += written;
             times.extend(took);
         }
-        Ok::<_, anyhow::Error>((transitions as f64 / started.elapsed().as_secs_f64(), times))
+        Ok::<_, anyhow::Error>((transitions as f64 / started.elapsed().as_secs_f64(), transitions, times))
     };
-    let (rate, _) = work(APPEND)?;
-    let (_, mut times) = work(1)?;
+    let (rate, written, _) = work(APPEND)?;
+    let (_, more, mut times) = work(1)?;
+    let described = runtime.block_on(describe(&service.endpoint)).map_err(anyhow::Error::from)?;
+    let stored = described.counters.unwrap_or_default().transitions;
+    ensure!(stored == (written + more) as u64, "{stored} of {} transitions are stored", written + more);
     times.sort_by(f64::total_cmp);
     Ok((rate, [0.5, 0.99].map(|share| times[((times.len() - 1) as f64 * share) as usize])))
 }
@@ -456,8 +459,8 @@ fn serve_bare(batch: usize) -> Result<()> {
     ];
     let columns: Vec<_> = columns.map(|(name, width)| column(name, width)).into();
     let minibatch = v1::Minibatch { columns, counters: Some(v1::ReplayCounters::default()) };
-    // As many as a message of the service holds: 4 MB, 16 at most.
-    let count = ((4 << 20) / (batch * 160 * 4)).clamp(1, PREFETCH);
+    // As many as a message of the service holds.
+    let count = ((4 << 20) / (batch * 160 * 4)).clamp(1, PREFETCH / 4);
     let reply = v1::SampleReply { minibatches: vec![minibatch; count] };
     Runtime::new()?.block_on(async {
         let incoming = TcpListenerStream::new(listen().await?);

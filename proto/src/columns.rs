@@ -31,6 +31,17 @@ pub fn encode(values: &[f32]) -> Bytes {
     bytes.into()
 }
 
+/// The little-endian bytes of `values`, without a copy where the machine is little-endian.
+pub fn into_bytes(values: Vec<f32>) -> Bytes {
+    struct Values(Vec<f32>);
+    impl AsRef<[u8]> for Values {
+        fn as_ref(&self) -> &[u8] {
+            bytemuck::cast_slice(&self.0)
+        }
+    }
+    if cfg!(target_endian = "little") { Bytes::from_owner(Values(values)) } else { encode(&values) }
+}
+
 /// Writes the values of `bytes` over `values`.
 ///
 /// # Panics
@@ -58,6 +69,12 @@ pub fn first_non_finite(bytes: &[u8]) -> Option<usize> {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    #[test]
+    fn bytes_of_owned_values_are_the_same() {
+        let values = vec![1.0, -2.5, f32::MIN_POSITIVE, 0.0];
+        assert_eq!(into_bytes(values.clone()), encode(&values));
+    }
 
     proptest! {
         #[test]

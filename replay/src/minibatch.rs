@@ -93,14 +93,14 @@ impl Minibatch {
         self.columns.iter().find(|column| column.name == name)
     }
 
-    pub(crate) fn to_wire(&self) -> v1::Minibatch {
-        let column = |column: &MinibatchColumn| v1::MinibatchColumn {
-            name: column.name.clone(),
+    pub(crate) fn into_wire(self) -> v1::Minibatch {
+        let column = |column: MinibatchColumn| v1::MinibatchColumn {
+            name: column.name,
             width: column.width as u32,
-            data: columns::encode(&column.data),
+            data: columns::into_bytes(column.data),
         };
         v1::Minibatch {
-            columns: self.columns.iter().map(column).collect(),
+            columns: self.columns.into_iter().map(column).collect(),
             counters: Some(self.counters.into()),
         }
     }

@@ -23,6 +23,8 @@ const REASON_TICK: Duration = Duration::from_secs(1);
 const CALL_PATIENCE: Duration = Duration::from_secs(5);
 /// A service that does not answer pings for this long is gone.
 const PING_EVERY: Duration = Duration::from_secs(10);
+/// Messages of credits that are enough for all that is fetched ahead.
+const CREDITS_AHEAD: u32 = 4;
 /// Bytes of a stream that may be on their way to a client that is not reading.
 const STREAM_WINDOW_BYTES: u32 = 8 << 20;
 
@@ -220,6 +222,8 @@ impl Fetching {
             Ok(response) => response.into_inner(),
             Err(status) => return End::from(status),
         };
+        // Taken since credits were last given.
+        let mut free = 0;
         let mut asked_why = tokio::time::interval(REASON_TICK);
         loop {
             tokio::select! {
@@ -239,9 +243,13 @@ impl Fetching {
                         return End::Dropped;
                     }
                     self.queued -= 1;
-                    let message = Some(credits_message(1));
-                    if requests.send(v1::SampleRequest { message }).await.is_err() {
-                        return End::Gone("it ended the stream".to_owned());
+                    free += 1;
+                    // A message of credits for some minibatches, and not for each.
+                    if free >= (self.prefetch as u32).div_ceil(CREDITS_AHEAD) {
+                        let message = Some(credits_message(std::mem::take(&mut free)));
+                        if requests.send(v1::SampleRequest { message }).await.is_err() {
+                            return End::Gone("it ended the stream".to_owned());
+                        }
                     }
                 },
                 _ = asked_why.tick(), if self.queued == 0 => {

@@ -33,9 +33,7 @@ pub struct Rewritten {
 /// # Errors
 /// [`StoreError`] if it is in use, or is no store; nothing has changed then.
 pub fn repair(dir: &Path) -> Result<Rewritten, StoreError> {
-    // The lock is let go before the survey, which takes it for a moment: the index can be read by one alone.
-    drop(lock(dir)?);
-    let found = Found::read(dir, |_, _| {})?;
+    let found = survey(dir)?;
     let _lock = lock(dir)?;
     if found.survey.damages.is_empty() {
         let (segments, transitions) = (found.survey.segments, found.survey.transitions);
@@ -55,8 +53,7 @@ pub fn repair(dir: &Path) -> Result<Rewritten, StoreError> {
 /// # Errors
 /// [`StoreError`] if it is in use, damaged, or no store; nothing has changed then.
 pub fn compact(dir: &Path, keep: Option<u64>) -> Result<Rewritten, StoreError> {
-    drop(lock(dir)?);
-    let found = Found::read(dir, |_, _| {})?;
+    let found = survey(dir)?;
     let _lock = lock(dir)?;
     if let Some(damage) = found.survey.damages.first() {
         return Err(StoreError::damaged(dir, damage));
@@ -65,6 +62,14 @@ pub fn compact(dir: &Path, keep: Option<u64>) -> Result<Rewritten, StoreError> {
     let (segments, transitions) = rewrite(dir, &found, excess)?;
     swap(dir, None)?;
     Ok(Rewritten { found: found.survey, segments, transitions, old: None })
+}
+
+/// All that a new log needs to know; an index that cannot be read now would cost it the marks.
+fn survey(dir: &Path) -> Result<Found, StoreError> {
+    // The lock is let go before, as the index is read under it.
+    drop(lock(dir)?);
+    let mut found = Found::read(dir, |_, _| {})?;
+    found.unread.take().map_or(Ok(found), Err)
 }
 
 /// Puts a new log together, without the oldest segments that make up to `excess` transitions; returns its segments

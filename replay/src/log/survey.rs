@@ -86,6 +86,8 @@ pub(super) struct Found {
     pub(super) end: State,
     /// Of all writers.
     pub(super) writers: Writers,
+    /// Why the index, damaged or not, could not be read now: a full disk, say.
+    pub(super) unread: Option<StoreError>,
 }
 
 impl Found {
@@ -122,11 +124,12 @@ impl Found {
                 disk_bytes: disk_bytes(dir),
                 damages: Vec::new(),
             },
+            unread: None,
             visit,
         };
         reading.read_index();
         reading.read_files()?;
-        let Reading { state, writers, mut survey, .. } = reading;
+        let Reading { state, writers, mut survey, unread, .. } = reading;
         match acknowledged {
             Ok(acknowledged) if state.segments < acknowledged => survey.damages.push(format!(
                 "{acknowledged} segments were acknowledged, and the files end after {}",
@@ -139,7 +142,7 @@ impl Found {
         survey.writers =
             writers.iter().map(|(writer, mark)| WriterMark { writer, sequence: mark.sequence }).collect();
         survey.writers.sort_unstable_by_key(|mark| mark.writer);
-        Ok(Self { survey, end: state, writers })
+        Ok(Self { survey, end: state, writers, unread })
     }
 }
 
@@ -192,6 +195,7 @@ struct Reading<'a, V> {
     state: State,
     writers: Writers,
     survey: Survey,
+    unread: Option<StoreError>,
     visit: V,
 }
 
@@ -207,7 +211,8 @@ impl<V: FnMut(State, Segment)> Reading<'_, V> {
             Ok((_, content)) => {
                 content.marks.into_iter().for_each(|(writer, mark)| self.writers.restore(writer, mark));
             }
-            Err(error) => self.survey.damages.push(what(error)),
+            Err(error @ StoreError::Damaged { .. }) => self.survey.damages.push(what(error)),
+            Err(error) => self.unread = Some(error),
         }
     }
 

@@ -15,9 +15,10 @@ type Replies = mpsc::Sender<Result<v1::SampleReply, Status>>;
 
 /// Credits messages that may be queued.
 const CREDITS: usize = 64;
-/// Bytes and minibatches of a message, at most (and never less than one minibatch).
+/// Bytes of a message, at most (and never less than one minibatch).
 const MESSAGE_BYTES: usize = 4 << 20;
-const MESSAGE_MINIBATCHES: usize = 16;
+/// Messages that a client's credits are spread over.
+const MESSAGES_AHEAD: u64 = 4;
 
 /// The source that serves a stream.
 pub(super) fn source(
@@ -98,12 +99,14 @@ fn gather(
         };
         let bytes: usize =
             minibatch.columns.iter().map(|column| column.data.len() * columns::VALUE_BYTES).sum();
-        let most = (MESSAGE_BYTES / bytes.max(1)).clamp(1, MESSAGE_MINIBATCHES).min(owed as usize);
-        let mut minibatches = vec![minibatch.to_wire()];
+        // A part of what is owed: while the client takes that in, the next is gathered.
+        let share = owed.div_ceil(MESSAGES_AHEAD) as usize;
+        let most = (MESSAGE_BYTES / bytes.max(1)).clamp(1, share);
+        let mut minibatches = vec![minibatch.into_wire()];
         while minibatches.len() < most
             && let Some(minibatch) = source.poll(Duration::ZERO)?
         {
-            minibatches.push(minibatch.to_wire());
+            minibatches.push(minibatch.into_wire());
         }
         owed -= minibatches.len() as u64;
         if replies.blocking_send(Ok(v1::SampleReply { minibatches })).is_err() {

@@ -52,22 +52,28 @@ pub struct Replay {
     pub shutdown: Shutdown,
     pub runtime: Runtime,
     serving: JoinHandle<Result<(), ServeError>>,
-    _dir: TempDir,
+    /// Removed with it, where it is its own.
+    _dir: Option<TempDir>,
 }
 
 impl Replay {
     pub fn start(spec: RunSpec, config: &ReplayConfig) -> Self {
         let dir = TempDir::new().unwrap();
+        let replay = Self::start_in(dir.path(), spec, config);
+        Self { _dir: Some(dir), ..replay }
+    }
+
+    pub fn start_in(dir: &Path, spec: RunSpec, config: &ReplayConfig) -> Self {
         let registry = Registry::new();
         let waits = Waits::new(&registry);
         let metrics = ReplayMetrics::new(&registry);
-        let store = Arc::new(Store::open(dir.path(), &spec, config, metrics, waits.clone()).unwrap());
+        let store = Arc::new(Store::open(dir, &spec, config, metrics, waits.clone()).unwrap());
         let runtime = Runtime::new().unwrap();
         let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0")).unwrap();
         let endpoint = listener.local_addr().unwrap().to_string();
         let shutdown = Shutdown::new();
         let serving = runtime.spawn(serve(listener, store.clone(), shutdown.clone()));
-        Self { spec, store, registry, waits, endpoint, shutdown, runtime, serving, _dir: dir }
+        Self { spec, store, registry, waits, endpoint, shutdown, runtime, serving, _dir: None }
     }
 
     /// Ends the service, and returns how it ended and how long that took.

@@ -1,0 +1,153 @@
+//! Bytes that mean nothing: every message and every stored file is parsed without a panic, and takes no more memory
+//! than its bytes.
+//!
+//! Half of the inputs are valid ones with some bytes changed, cut out or repeated; the others are noise. A thousand
+//! inputs each by default, half a million each with `GETUP_TEST_FULL`.
+
+mod common;
+mod fixtures;
+
+use bytes::Bytes;
+use fixtures::{Ending, Part, get_up_spec, spec};
+use getup_proto::{RunSpec, Segment, v1};
+use getup_replay::{SampleOptions, Survey};
+use prost::Message;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use std::fs;
+use tempfile::TempDir;
+
+fn inputs() -> u64 {
+    if std::env::var_os("GETUP_TEST_FULL").is_some() { 500_000 } else { 1_000 }
+}
+
+/// Something like `valid`, or nothing like it.
+fn mangled(rng: &mut ChaCha8Rng, valid: &[u8]) -> Vec<u8> {
+    if rng.random_bool(0.1) {
+        let length = rng.random_range(0..400);
+        return (0..length).map(|_| rng.random()).collect();
+    }
+    let mut bytes = valid.to_vec();
+    for _ in 0..rng.random_range(1..6) {
+        if bytes.is_empty() {
+            break;
+        }
+        let place = rng.random_range(0..bytes.len());
+        // Most of a message is values; its fields lie at the front.
+        let place = if rng.random_bool(0.6) { place.min(rng.random_range(0..64)) } else { place };
+        match rng.random_range(0..5) {
+            0 => bytes[place] = rng.random(),
+            1 => bytes[place] = [0, 0x7f, 0x80, 0xff][rng.random_range(0..4)],
+            2 => bytes.truncate(place),
+            3 => {
+                let end = (place + rng.random_range(1..40)).min(bytes.len());
+                bytes.drain(place..end);
+            }
+            _ => {
+                let end = (place + rng.random_range(1..40)).min(bytes.len());
+                let piece = bytes[place..end].to_vec();
+                bytes.splice(place..place, piece);
+            }
+        }
+    }
+    bytes
+}
+
+#[test]
+fn segments_are_parsed_or_refused() {
+    let spec = spec(8);
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let part = Part {
+        writer: 1,
+        sequence: 1,
+        lane: 2,
+        episode: 3,
+        first_step: 4,
+        steps: 8,
+        ending: Ending::Terminal,
+    };
+    let valid = part.build(&spec).to_wire().encode_to_vec();
+    let (mut decoded, mut parsed) = (0, 0);
+    for _ in 0..inputs() {
+        let bytes = Bytes::from(mangled(&mut rng, &valid));
+        let Ok(wire) = v1::Segment::decode(bytes) else { continue };
+        decoded += 1;
+        if let Ok(segment) = Segment::parse(wire, &spec) {
+            parsed += 1;
+            // What is accepted follows the spec whatever it was made of.
+            assert!(segment.check(&spec).is_ok());
+            assert_eq!(Segment::parse(segment.to_wire(), &spec).unwrap(), segment);
+        }
+    }
+    assert!(
+        decoded > inputs() / 20 && parsed > 0,
+        "{decoded} decoded, {parsed} parsed: the inputs reach nothing"
+    );
+}
+
+#[test]
+fn requests_are_parsed_or_refused() {
+    let mut rng = ChaCha8Rng::seed_from_u64(2);
+    let spec = get_up_spec();
+    let replay = common::Replay::start(spec.clone(), &common::config());
+    let hello = v1::SampleHello {
+        spec: Some(spec.to_wire()),
+        batch: 256,
+        n_step: 5,
+        gamma: 0.9,
+        seed: 1,
+        name: "learner".to_owned(),
+    };
+    let sample =
+        v1::SampleRequest { message: Some(v1::sample_request::Message::Hello(hello)) }.encode_to_vec();
+    let append = v1::AppendRequest { message: Some(common::hello(&spec, 1)) }.encode_to_vec();
+    let mut specs = 0;
+    let mut check_spec = |wire: Option<v1::RunSpec>| {
+        if let Some(Ok(parsed)) = wire.map(RunSpec::parse) {
+            specs += 1;
+            assert!(parsed.validate().is_ok());
+        }
+    };
+    for _ in 0..inputs() {
+        if let Ok(v1::SampleRequest { message: Some(v1::sample_request::Message::Hello(hello)) }) =
+            v1::SampleRequest::decode(Bytes::from(mangled(&mut rng, &sample)))
+        {
+            let (batch, n_step) = (hello.batch as usize, hello.n_step as usize);
+            let options = SampleOptions { batch, n_step, gamma: hello.gamma, seed: hello.seed };
+            // What is accepted fits into a message.
+            if replay.store.check_options(&options).is_ok() {
+                assert!(batch * (2 * 68 + 24) * 4 <= getup_proto::MAX_MESSAGE_BYTES);
+            }
+            check_spec(hello.spec);
+        }
+        if let Ok(v1::AppendRequest { message: Some(v1::append_request::Message::Hello(hello)) }) =
+            v1::AppendRequest::decode(Bytes::from(mangled(&mut rng, &append)))
+        {
+            check_spec(hello.spec);
+        }
+    }
+    assert!(specs > inputs() / 50, "{specs} specs: the inputs reach nothing");
+}
+
+#[test]
+fn stored_files_are_read_or_named_as_damaged() {
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    let dir = TempDir::new().unwrap();
+    let spec = spec(8);
+    let store = common::open(dir.path(), &spec, &common::config()).unwrap();
+    store.append((1..=6).map(|i| fixtures::segment(&spec, 1, i, 8)).collect()).unwrap();
+    drop(store);
+    let path = fs::read_dir(dir.path().join("segments")).unwrap().next().unwrap().unwrap().path();
+    let valid = fs::read(&path).unwrap();
+    let mut damaged = 0;
+    // A survey opens sled too: slower than the parsers by far.
+    for _ in 0..inputs() / 10 {
+        fs::write(&path, mangled(&mut rng, &valid)).unwrap();
+        let mut segments = 0;
+        let survey = Survey::read(dir.path(), |_| segments += 1).unwrap();
+        assert_eq!(survey.segments, segments);
+        assert!(segments <= 12);
+        damaged += u64::from(!survey.damages.is_empty());
+    }
+    assert!(damaged > inputs() / 40, "{damaged}: the inputs reach nothing");
+}
