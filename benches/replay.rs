@@ -12,6 +12,7 @@
 //! | `in-process sample` | transitions a second of `Store::try_sample`, batch 256 | | a bare gather of as many rows at random places of a flat array |
 //! | `… latency` | seconds: p50 and p99 until 64 steps are acknowledged, nothing else on its way; of a minibatch at full speed | the same of Reverb | |
 //! | `resident memory`, `restart` | at a million transitions | the same of Reverb | 1.4 × the raw bytes; 5 s |
+//! | `snapshot` | the longest pause of appends | | |
 //!
 //! Both sides take turns; ratios and shares are medians over them. `benches/replay_reverb.py` is the peer, and says how
 //! it is treated fairly.
@@ -37,7 +38,7 @@ use getup_proto::v1::replay_server::{Replay, ReplayServer};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment, v1};
 use getup_replay::{
     MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, ReplayMetrics, SampleOptions, Sampler, Store,
-    SyncMode, describe, serve,
+    SyncMode, describe, serve, take_snapshot,
 };
 use getup_telemetry::{Registry, Shutdown, Waits};
 use rand::{Rng, SeedableRng};
@@ -80,6 +81,7 @@ fn main() -> Result<()> {
     fill(dir.path())?;
     let service = Service::start(&["serve", &dir.path().display().to_string(), "process"])?;
     rows.push(memory_row(&runtime, &service, &mut peer)?);
+    rows.push(snapshot_row(&runtime, &service)?);
     for batch in [256, 1024] {
         rows.extend(sample_rows(&runtime, &service, &mut peer, batch)?);
     }
@@ -183,6 +185,17 @@ fn memory_row(runtime: &Runtime, service: &Service, peer: &mut Reverb) -> Result
     Ok(row)
 }
 
+/// How long appends wait for a snapshot: the longest of several.
+fn snapshot_row(runtime: &Runtime, service: &Service) -> Result<Row> {
+    let mut longest: f64 = 0.0;
+    for n in 0..10 {
+        let taken = runtime.block_on(take_snapshot(&service.endpoint, &format!("bench-{n}")));
+        longest = longest.max(1e3 * taken.map_err(anyhow::Error::from)?.paused_seconds);
+    }
+    let name = "snapshot, 1 M transitions, longest pause".to_owned();
+    Ok(row(name, "ms (less is better)", longest, None, None, None))
+}
+
 fn restart_row(runtime: &Runtime, dir: &Path, peer: &mut Reverb) -> Result<Row> {
     let mut times = Vec::new();
     for _ in 0..TURNS {
@@ -211,7 +224,7 @@ fn in_process_row(dir: &Path) -> Result<Row> {
     const BATCH: usize = 256;
     let store = open(dir, SyncMode::Process)?;
     let options = SampleOptions { batch: BATCH, n_step: 1, gamma: 0.97, seed: 1 };
-    let mut sampler = Sampler::uniform(1);
+    let mut sampler = Sampler::new(1);
     let flat = vec![0.5f32; FULL * VALUES];
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     // Places of the columns in a row, and once more the observation: the one that follows.
@@ -491,6 +504,13 @@ impl Replay for Bare {
     }
 
     async fn describe(&self, _: Request<v1::DescribeRequest>) -> Result<Response<v1::DescribeReply>, Status> {
+        Err(Status::unimplemented("it only sends"))
+    }
+
+    async fn update_priorities(
+        &self,
+        _: Request<v1::UpdatePrioritiesRequest>,
+    ) -> Result<Response<v1::UpdatePrioritiesReply>, Status> {
         Err(Status::unimplemented("it only sends"))
     }
 

@@ -206,6 +206,7 @@ impl Config {
             samples_per_insert: Some(samples_per_insert),
             // A tenth of the first minibatches, and room for two of the longest segments and for a minibatch.
             error_buffer: Some((0.1 * middle).max(2.0 * segment).max(2.0 * self.sac.batch as f64)),
+            ..ReplayConfig::default()
         }
     }
 

@@ -1,5 +1,6 @@
 //! The settings of a replay: [`ReplayConfig`].
 
+use crate::selector::ItemSelector;
 use getup_proto::RunSpec;
 use serde::{Deserialize, Serialize};
 
@@ -30,6 +31,11 @@ pub struct ReplayConfig {
     pub error_buffer: Option<f64>,
     /// What an acknowledged segment survives.
     pub sync: SyncMode,
+    /// How transitions are drawn.
+    pub sampler: ItemSelector,
+    /// How often a transition may be drawn, from 1; without it, any number of times. Counts begin anew at a restart.
+    /// With 1 and `fifo` the store is a queue.
+    pub max_times_sampled: Option<u32>,
 }
 
 impl Default for ReplayConfig {
@@ -40,6 +46,8 @@ impl Default for ReplayConfig {
             samples_per_insert: None,
             error_buffer: None,
             sync: SyncMode::Process,
+            sampler: ItemSelector::Uniform,
+            max_times_sampled: None,
         }
     }
 }
@@ -70,6 +78,12 @@ pub enum ConfigError {
     /// `samples_per_insert` is not a positive number.
     #[error("replay.samples_per_insert is {0}: it must be positive; leave it out for no limit")]
     SamplesPerInsert(f64),
+    /// The exponent of priorities is no number from 0.
+    #[error("replay.sampler.prioritized.exponent is {0}: it must lie in 0..=10 (0.6 is usual)")]
+    Exponent(f64),
+    /// Nothing could ever be drawn.
+    #[error("replay.max_times_sampled is 0: it must be 1 or more; leave it out for no limit")]
+    MaxTimesSampled,
     /// `error_buffer` is so narrow that writers and samplers would wait for each other.
     #[error(
         "replay.error_buffer is {error_buffer}: it must be at least {min}, samples_per_insert times the longest \
@@ -111,6 +125,14 @@ impl ReplayConfig {
         if !(1..=self.capacity as u64).contains(&self.min_size) {
             return Err(ConfigError::MinSize { min_size: self.min_size, capacity: self.capacity });
         }
+        if let ItemSelector::Prioritized { exponent } = self.sampler
+            && !(0.0..=10.0).contains(&exponent)
+        {
+            return Err(ConfigError::Exponent(exponent));
+        }
+        if self.max_times_sampled == Some(0) {
+            return Err(ConfigError::MaxTimesSampled);
+        }
         let Some(samples_per_insert) = self.samples_per_insert else { return Ok(()) };
         if !(samples_per_insert.is_finite() && samples_per_insert > 0.0) {
             return Err(ConfigError::SamplesPerInsert(samples_per_insert));
@@ -141,6 +163,9 @@ mod tests {
         assert!(refused(&|c| c.min_size = 0).contains("replay.min_size is 0"));
         assert!(refused(&|c| c.min_size = 1_000_001).contains("replay.min_size is 1000001"));
         assert!(refused(&|c| c.samples_per_insert = Some(-1.0)).contains("samples_per_insert is -1"));
+        assert!(refused(&|c| c.max_times_sampled = Some(0)).contains("max_times_sampled is 0"));
+        let steep = refused(&|c| c.sampler = ItemSelector::Prioritized { exponent: f64::NAN });
+        assert!(steep.contains("exponent is NaN"), "{steep}");
         let narrow = refused(&|c| {
             c.samples_per_insert = Some(256.0);
             c.error_buffer = Some(1000.0);

@@ -78,9 +78,10 @@ impl Gate {
         self.lock().limiter.clone()
     }
 
-    /// Counts segments that are durable and can be sampled.
-    pub(crate) fn insert(&self, segments: &[&Segment]) {
+    /// Counts segments that are durable and can be sampled; `available` draws are left then.
+    pub(crate) fn insert(&self, segments: &[&Segment], available: Option<u64>) {
         let mut inner = self.lock();
+        inner.limiter.set_available(available);
         for segment in segments {
             inner.limiter.insert(u64::from(segment.env_steps));
             if let Some(peer) = inner.writers.get_mut(&segment.writer) {
@@ -107,6 +108,11 @@ impl Gate {
         drop(inner);
         self.wake();
         Ok(true)
+    }
+
+    /// Notes how many draws are left.
+    pub(crate) fn set_available(&self, available: Option<u64>) {
+        self.lock().limiter.set_available(available);
     }
 
     /// Waits until a sample of this size might be let through; `wait` goes on over several calls. False when `cancelled` or `patience` ends the wait.

@@ -11,8 +11,7 @@
 //! `reward + discount × V(next)` whatever n is. The sum runs over neighbouring segments of the episode.
 
 use crate::minibatch::{MinibatchColumn, SampleOptions};
-use crate::ring::{Entry, LayoutColumn, Ring, Row};
-use crate::sampler::Sampler;
+use crate::ring::{Drawn, Entry, LayoutColumn, Ring, Row};
 use getup_proto::{Rows, columns};
 use std::ops::Range;
 
@@ -27,16 +26,12 @@ struct Transition {
     discount: f32,
 }
 
-/// Draws a minibatch's transitions and copies them into columns, in the order of [`crate::Minibatch`].
-///
-/// # Panics
-/// If the ring is empty.
-pub(crate) fn gather(ring: &Ring, sampler: &mut Sampler, options: &SampleOptions) -> Vec<MinibatchColumn> {
+/// Copies the transitions that were drawn into columns, in the order of [`crate::Minibatch`].
+pub(crate) fn gather(ring: &Ring, drawn: &[Drawn], options: &SampleOptions) -> Vec<MinibatchColumn> {
     let reward = ring.layout().columns.iter().find(|column| column.name == columns::REWARD);
     let reward = reward.map(|column| column.at.start);
-    let transitions: Vec<Transition> = (0..options.batch)
-        .map(|_| span(ring, sampler.draw(ring), reward, options.n_step, options.gamma))
-        .collect();
+    let span = |drawn: &Drawn| span(ring, drawn.row, reward, options.n_step, options.gamma);
+    let transitions: Vec<Transition> = drawn.iter().map(span).collect();
 
     let layout = &ring.layout().columns;
     let mut gathered: Vec<MinibatchColumn> = layout

@@ -1,5 +1,7 @@
 use super::*;
+use crate::config::ReplayConfig;
 use crate::fixtures::{self, Ending, Part};
+use crate::sampler::Sampler;
 use getup_proto::Segment;
 use proptest::prelude::*;
 
@@ -48,7 +50,7 @@ proptest! {
         n in 1usize..=20,
     ) {
         let segments = episodes(&lengths, cut);
-        let mut ring = Ring::new(&fixtures::spec(8), 1000);
+        let mut ring = Ring::new(&fixtures::spec(8), &ReplayConfig::default());
         let mut steps = Vec::new();
         for segment in &segments {
             ring.push(segment);
@@ -73,7 +75,7 @@ proptest! {
 #[test]
 fn a_transition_is_shorter_while_the_next_segment_has_not_come_and_whole_once_it_has() {
     let segments = episodes(&[(16, Ending::Truncated)], 8);
-    let mut ring = Ring::new(&fixtures::spec(8), 100);
+    let mut ring = Ring::new(&fixtures::spec(8), &ReplayConfig { capacity: 100, ..ReplayConfig::default() });
     ring.push(&segments[0]);
     let row = ring.nth_row(6);
     let short = span(&ring, row, Some(reward_place(&ring)), 4, GAMMA);
@@ -88,12 +90,13 @@ fn a_transition_is_shorter_while_the_next_segment_has_not_come_and_whole_once_it
 
 #[test]
 fn columns_come_in_the_order_of_the_spec_then_the_next_states_then_the_discount() {
-    let mut ring = Ring::new(&fixtures::spec(8), 100);
+    let mut ring = Ring::new(&fixtures::spec(8), &ReplayConfig { capacity: 100, ..ReplayConfig::default() });
     for segment in episodes(&[(30, Ending::Terminal), (20, Ending::Truncated)], 7) {
         ring.push(&segment);
     }
     let options = SampleOptions { batch: 64, n_step: 1, gamma: GAMMA, seed: 0 };
-    let columns = gather(&ring, &mut Sampler::uniform(5), &options);
+    let drawn = Sampler::new(5).draw_uniformly(&ring, options.batch);
+    let columns = gather(&ring, &drawn, &options);
     let shape: Vec<_> = columns.iter().map(|c| (c.name.as_str(), c.width, c.data.len())).collect();
     let expected = [
         ("observation", 3, 192),

@@ -14,7 +14,8 @@
 //! | `log` | the durable log: commits, eviction, recovery, snapshots, repair |
 //! | `ring` | the newest transitions in memory |
 //! | `gather` | from drawn rows to contiguous columns, with n-step returns |
-//! | `sampler` | [`Sampler`]: which transitions are drawn |
+//! | `selector`, `sum_tree` | [`ItemSelector`]: which transitions are drawn: uniform, prioritized, FIFO, LIFO |
+//! | `sampler` | [`Sampler`]: whose random numbers decide |
 //! | `limiter` | Reverb's cursor between two bounds, a pure state machine |
 //! | `gate` | the limiter with its doors: who waits there, and for whom |
 //! | `service` | [`serve`]: the streams of writers and samplers |
@@ -34,9 +35,11 @@ mod minibatch;
 mod remote;
 mod ring;
 mod sampler;
+mod selector;
 mod service;
 mod source;
 mod store;
+mod sum_tree;
 
 #[cfg(test)]
 #[path = "../tests/fixtures/mod.rs"]
@@ -47,9 +50,12 @@ pub use error::StoreError;
 pub use export::{DatasetId, ExportError, Exported, export_minari, export_npz};
 pub use log::{Ever, Rewritten, Survey, WriterMark, compact, repair, segments};
 pub use metrics::ReplayMetrics;
-pub use minibatch::{MAX_N_STEP, Minibatch, MinibatchColumn, OptionsError, ReplayCounters, SampleOptions};
-pub use remote::{RemoteOptions, RemoteSource, describe, take_snapshot};
+pub use minibatch::{
+    Item, MAX_N_STEP, Minibatch, MinibatchColumn, OptionsError, ReplayCounters, SampleOptions,
+};
+pub use remote::{RemoteOptions, RemoteSource, describe, take_snapshot, update_priorities};
 pub use sampler::Sampler;
+pub use selector::ItemSelector;
 pub use service::{ServeError, serve};
 pub use source::{LocalSource, MinibatchSource, SampleError};
 pub use store::Store;

@@ -38,6 +38,8 @@ pub(crate) struct Limiter {
     reserved: u64,
     /// Transitions handed out.
     samples: u64,
+    /// Draws that are left in the store; None where there is no limit.
+    available: Option<u64>,
     /// Added to the cursor where an earlier process had other settings; see [`Limiter::restore`].
     offset: f64,
 }
@@ -47,6 +49,8 @@ pub(crate) struct Limiter {
 pub(crate) enum Blocked {
     /// Too few env steps for the first sample.
     MinSize { inserts: u64, min_size: u64 },
+    /// Every transition has been sampled as often as it may be.
+    Consumed { available: u64, transitions: u64 },
     /// A sample would take the cursor below its band.
     SamplesAhead { inserts: u64, samples: u64, samples_per_insert: f64 },
     /// An insert would lift the cursor above its band.
@@ -62,7 +66,15 @@ impl Limiter {
             let error_buffer = config.error_buffer.unwrap_or_else(|| longest.max(0.1 * middle));
             Band { samples_per_insert, min: middle - error_buffer, max: middle + error_buffer }
         });
-        Self { min_size: config.min_size, band, inserts: 0, reserved: 0, samples: 0, offset: 0.0 }
+        Self {
+            min_size: config.min_size,
+            band,
+            inserts: 0,
+            reserved: 0,
+            samples: 0,
+            available: None,
+            offset: 0.0,
+        }
     }
 
     /// Goes on from the totals of earlier processes.
@@ -95,6 +107,11 @@ impl Limiter {
         if self.inserts < self.min_size {
             return Some(Blocked::MinSize { inserts: self.inserts, min_size: self.min_size });
         }
+        if let Some(available) = self.available
+            && available < transitions
+        {
+            return Some(Blocked::Consumed { available, transitions });
+        }
         let band = self.band?;
         let waits = self.cursor_at(self.inserts, self.samples + transitions) < band.min;
         waits.then_some(Blocked::SamplesAhead {
@@ -112,6 +129,11 @@ impl Limiter {
     /// Gives that room back: the insert is durable and counted, or will not happen.
     pub(crate) fn release(&mut self, env_steps: u64) {
         self.reserved -= env_steps;
+    }
+
+    /// Notes how many draws are left in the store.
+    pub(crate) fn set_available(&mut self, available: Option<u64>) {
+        self.available = available;
     }
 
     /// Counts env steps that have become durable.
@@ -161,6 +183,12 @@ impl fmt::Display for Blocked {
             Self::MinSize { inserts, min_size } => {
                 write!(f, "{} of {} transitions", thousands(inserts), thousands(min_size))
             }
+            Self::Consumed { available, transitions } => write!(
+                f,
+                "{} of {} transitions that were not sampled as often as they may be",
+                thousands(available),
+                thousands(transitions)
+            ),
             Self::SamplesAhead { inserts, samples, samples_per_insert } => write!(
                 f,
                 "{} samples of {} env steps are ahead of {samples_per_insert} samples per insert",

@@ -40,8 +40,19 @@ pub struct ReplayCounters {
 pub struct Minibatch {
     /// Each of `batch` × its width values.
     pub columns: Vec<MinibatchColumn>,
+    /// What was drawn, transition by transition; empty where the store draws uniformly, without a limit.
+    pub items: Vec<Item>,
     /// The store's totals, this minibatch included.
     pub counters: ReplayCounters,
+}
+
+/// A transition that was drawn from a store whose sampler is not plainly uniform.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Item {
+    /// Names it for as long as it is stored, also after a restart: the transitions ever stored before it.
+    pub key: u64,
+    /// With which it was drawn; 1 where the sampler does not draw lots.
+    pub probability: f32,
 }
 
 /// One column, row after row.
@@ -79,6 +90,14 @@ pub enum OptionsError {
     /// No steps, or more than [`MAX_N_STEP`].
     #[error("n_step is {0}: it must lie in 1..={MAX_N_STEP}")]
     NStep(usize),
+    /// Not a priority.
+    #[error("the priority of transition {key} is {priority}: it must be finite, and 0 or more")]
+    Priority {
+        /// Of the transition.
+        key: u64,
+        /// As given.
+        priority: f32,
+    },
     /// Not a discount.
     #[error("gamma is {0}: it must lie in [0, 1]")]
     Gamma(f32),
@@ -93,6 +112,14 @@ impl Minibatch {
         self.columns.iter().find(|column| column.name == name)
     }
 
+    /// The weights that make up for priorities: (N · P(i))^−exponent over the greatest of them (Schaul et al. 2016,
+    /// §3.4), one a transition. `exponent` is β, from 0 (no correction) to 1.
+    pub fn importance_weights(&self, exponent: f32) -> Vec<f32> {
+        // N, and all that the weights have in common, cancels.
+        let least = self.items.iter().map(|item| item.probability).fold(f32::INFINITY, f32::min);
+        self.items.iter().map(|item| (item.probability / least).powf(-exponent)).collect()
+    }
+
     pub(crate) fn into_wire(self) -> v1::Minibatch {
         let column = |column: MinibatchColumn| v1::MinibatchColumn {
             name: column.name,
@@ -102,13 +129,22 @@ impl Minibatch {
         v1::Minibatch {
             columns: self.columns.into_iter().map(column).collect(),
             counters: Some(self.counters.into()),
+            keys: self.items.iter().map(|item| item.key).collect(),
+            probabilities: self.items.iter().map(|item| item.probability).collect(),
         }
     }
 
     /// Parses a message; None unless every column has `batch` rows and the counters are there.
     pub(crate) fn parse(wire: v1::Minibatch, batch: usize) -> Option<Self> {
         let columns = wire.columns.into_iter().map(|column| MinibatchColumn::parse(column, batch));
-        Some(Self { columns: columns.collect::<Option<_>>()?, counters: wire.counters?.into() })
+        let items = wire.keys.iter().zip(&wire.probabilities);
+        let whole = wire.keys.len() == wire.probabilities.len() && [0, batch].contains(&wire.keys.len());
+        whole.then_some(())?;
+        Some(Self {
+            columns: columns.collect::<Option<_>>()?,
+            items: items.map(|(&key, &probability)| Item { key, probability }).collect(),
+            counters: wire.counters?.into(),
+        })
     }
 }
 

@@ -128,6 +128,18 @@ pub async fn describe(endpoint: &str) -> Result<v1::DescribeReply, Status> {
     ask(ReplayClient::new(channel)).await
 }
 
+/// Gives transitions of a service's store priorities, by their keys; returns how many were still there.
+///
+/// # Errors
+/// As [`describe`]; INVALID_ARGUMENT if one is negative or not finite, and then none is given.
+pub async fn update_priorities(endpoint: &str, priorities: &[(u64, f32)]) -> Result<u64, Status> {
+    let channel = connect(endpoint).await.map_err(|error| Status::unavailable(error.to_string()))?;
+    let (keys, priorities) = priorities.iter().copied().unzip();
+    let mut client = ReplayClient::new(channel).max_encoding_message_size(MAX_MESSAGE_BYTES);
+    let reply = client.update_priorities(v1::UpdatePrioritiesRequest { keys, priorities }).await?;
+    Ok(reply.into_inner().updated)
+}
+
 /// Has the service copy its store to `snapshots/NAME` in its folder.
 ///
 /// # Errors

@@ -11,7 +11,10 @@
 //! function of the segments pushed most recently, however many were pushed before: a ring that is rebuilt from
 //! the log equals the one that was lost.
 
+use crate::config::ReplayConfig;
+use crate::selector::Selector;
 use getup_proto::{ColumnSpec, Rows, RunSpec, Segment, columns};
+use rand::Rng;
 use std::collections::{HashMap, VecDeque};
 use std::ops::Range;
 
@@ -48,6 +51,19 @@ pub(crate) struct Ring {
     first_slot: usize,
     /// The newest segment of each episode that may go on.
     unfinished: HashMap<Lane, u64>,
+    /// None where any row may be drawn any number of times.
+    selector: Option<Selector>,
+    /// Key of the next transition that is pushed: the transitions ever stored before it.
+    next_key: u64,
+}
+
+/// A transition that was drawn.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(crate) struct Drawn {
+    /// Where it begins.
+    pub(crate) row: Row,
+    /// With which it was drawn.
+    pub(crate) probability: f64,
 }
 
 /// Where each column of the spec lies in a row.
@@ -74,6 +90,8 @@ type Lane = (u64, u32);
 #[derive(Clone, Debug)]
 pub(crate) struct Entry {
     pub(crate) first_row: Row,
+    /// Key of its first transition.
+    first_key: u64,
     pub(crate) steps: usize,
     pub(crate) terminal: bool,
     /// Number of the segment that continues the episode.
@@ -85,8 +103,9 @@ pub(crate) struct Entry {
 }
 
 impl Ring {
-    /// An empty ring for `capacity` transitions. Memory is taken as it fills.
-    pub(crate) fn new(spec: &RunSpec, capacity: usize) -> Self {
+    /// An empty ring for `config.capacity` transitions, drawn as `config` says. Memory is taken as it fills.
+    pub(crate) fn new(spec: &RunSpec, config: &ReplayConfig) -> Self {
+        let capacity = config.capacity;
         let layout = Layout::new(spec);
         // One row more a segment: enough where segments have 8 steps on average. Below that rows run out before
         // transitions do, and the ring holds somewhat fewer.
@@ -102,6 +121,8 @@ impl Ring {
             live: 0..0,
             first_slot: 0,
             unfinished: HashMap::new(),
+            selector: Selector::new(config.sampler, config.max_times_sampled, slots),
+            next_key: 0,
         }
     }
 
@@ -115,10 +136,17 @@ impl Ring {
         let first_row = Row(self.live.end);
         self.live.end += rows;
         self.write_rows(first_row, segment);
+        if let Some(selector) = &mut self.selector {
+            for step in 0..segment.steps as u64 {
+                let slot = self.first_slot + (first_row.0 + step - self.live.start) as usize;
+                selector.insert(slot % self.slots);
+            }
+        }
         self.link(number, segment);
         self.transitions += segment.steps;
         self.segments.push_back(Entry {
             first_row,
+            first_key: self.next_key,
             steps: segment.steps,
             terminal: segment.terminal,
             continued_by: None,
@@ -126,6 +154,7 @@ impl Ring {
             episode: segment.episode,
             next_step: u64::from(segment.first_step) + segment.steps as u64,
         });
+        self.next_key += segment.steps as u64;
     }
 
     /// Transitions in the ring.
@@ -141,6 +170,69 @@ impl Ring {
     /// Bytes that a full ring takes.
     pub(crate) fn memory_bytes(&self) -> usize {
         size_of_val(self.values.as_slice())
+    }
+
+    /// Numbers the transitions so that so many were ever stored: keys are the same after a restart.
+    pub(crate) fn set_stored(&mut self, transitions: u64) {
+        let shift = transitions - self.next_key;
+        self.next_key = transitions;
+        self.segments.iter_mut().for_each(|entry| entry.first_key += shift);
+    }
+
+    /// Whether draws leave a trace, or depend on more than the rows: [`Ring::draw`] then, and not
+    /// [`Ring::draw_uniformly`].
+    pub(crate) fn selects(&self) -> bool {
+        self.selector.is_some()
+    }
+
+    /// How many draws are left before transitions must come; None where there is no limit.
+    pub(crate) fn available(&self) -> Option<u64> {
+        self.selector.as_ref().and_then(Selector::available)
+    }
+
+    /// Draws a transition, each with the same probability.
+    ///
+    /// # Panics
+    /// If the ring is empty.
+    pub(crate) fn draw_uniformly(&self, rng: &mut impl Rng) -> Drawn {
+        loop {
+            // Rows are uniform, and so are those of them that begin a transition: all but one a segment.
+            let row = self.nth_row(rng.random_range(0..self.rows()));
+            if self.steps_from(self.slot(row)) > 0 {
+                return Drawn { row, probability: 1.0 / self.transitions as f64 };
+            }
+        }
+    }
+
+    /// Draws a transition as the store's sampler does.
+    ///
+    /// # Panics
+    /// If there is none that can be drawn.
+    pub(crate) fn draw(&mut self, rng: &mut impl Rng) -> Drawn {
+        let Some(selector) = &mut self.selector else { return self.draw_uniformly(rng) };
+        let (slot, probability) = selector.draw(rng, self.first_slot);
+        let from_oldest = (slot + self.slots - self.first_slot) % self.slots;
+        Drawn { row: Row(self.live.start + from_oldest as u64), probability }
+    }
+
+    /// What names a transition for as long as it is stored, also after a restart.
+    pub(crate) fn key(&self, row: Row) -> u64 {
+        let entry = self.entry_of(row);
+        entry.first_key + (row.0 - entry.first_row.0)
+    }
+
+    /// Gives a transition a priority; false if it is gone, or priorities do not count.
+    pub(crate) fn set_priority(&mut self, key: u64, priority: f32) -> bool {
+        let Some(place) = self.segments.partition_point(|entry| entry.first_key <= key).checked_sub(1) else {
+            return false;
+        };
+        let entry = &self.segments[place];
+        let step = key - entry.first_key;
+        if step >= entry.steps as u64 {
+            return false;
+        }
+        let slot = self.slot(Row(entry.first_row.0 + step));
+        self.selector.as_mut().is_some_and(|selector| selector.set_priority(slot, priority))
     }
 
     pub(crate) fn layout(&self) -> &Layout {
@@ -185,6 +277,9 @@ impl Ring {
 
     fn evict(&mut self) {
         let entry = self.segments.pop_front().expect("a ring has room for its longest segment");
+        if let Some(selector) = &mut self.selector {
+            (0..entry.steps).for_each(|step| selector.remove((self.first_slot + step) % self.slots));
+        }
         self.transitions -= entry.steps;
         self.live.start += entry.steps as u64 + 1;
         self.first_slot = (self.first_slot + entry.steps + 1) % self.slots;

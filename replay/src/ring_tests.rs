@@ -2,6 +2,10 @@ use super::*;
 use crate::fixtures::{self, Ending, Part};
 use proptest::prelude::*;
 
+fn empty(spec: &RunSpec, capacity: usize) -> Ring {
+    Ring::new(spec, &ReplayConfig { capacity, ..ReplayConfig::default() })
+}
+
 /// What the ring holds, in terms that do not depend on where it lies in memory.
 fn contents(ring: &Ring) -> Vec<(Vec<f32>, bool)> {
     (0..ring.rows())
@@ -18,7 +22,7 @@ fn contents(ring: &Ring) -> Vec<(Vec<f32>, bool)> {
 #[test]
 fn every_row_of_a_segment_is_kept_as_it_came() {
     let spec = fixtures::spec(8);
-    let mut ring = Ring::new(&spec, 32);
+    let mut ring = empty(&spec, 32);
     let segment = fixtures::segment(&spec, 4, 9, 5);
     ring.push(&segment);
     let contents = contents(&ring);
@@ -42,7 +46,7 @@ proptest! {
     ) {
         let spec = fixtures::spec(8);
         let segments: Vec<Segment> = (1..).zip(&lengths).map(|(i, &n)| fixtures::segment(&spec, 1, i, n)).collect();
-        let mut ring = Ring::new(&spec, capacity);
+        let mut ring = empty(&spec, capacity);
         let memory = ring.memory_bytes();
         for segment in &segments {
             ring.push(segment);
@@ -50,7 +54,7 @@ proptest! {
         }
         prop_assert_eq!(ring.memory_bytes(), memory);
         let kept = ring.segments.len();
-        let mut rebuilt = Ring::new(&spec, capacity);
+        let mut rebuilt = empty(&spec, capacity);
         for segment in &segments[segments.len() - kept..] {
             rebuilt.push(segment);
         }
@@ -72,7 +76,7 @@ fn a_segment_is_linked_to_the_one_that_continues_its_episode_and_to_no_other() {
     let part = |sequence, lane, episode, first_step, ending| {
         Part { writer: 1, sequence, lane, episode, first_step, steps: 4, ending }.build(&spec)
     };
-    let mut ring = Ring::new(&spec, 64);
+    let mut ring = empty(&spec, 64);
     ring.push(&part(1, 0, 0, 0, Ending::None));
     ring.push(&part(2, 1, 0, 0, Ending::None));
     ring.push(&part(3, 0, 0, 4, Ending::Terminal)); // continues 1
@@ -87,7 +91,7 @@ fn a_segment_is_linked_to_the_one_that_continues_its_episode_and_to_no_other() {
 #[test]
 fn an_evicted_segment_is_forgotten_by_those_that_would_continue_it() {
     let spec = fixtures::spec(8);
-    let mut ring = Ring::new(&spec, 16);
+    let mut ring = empty(&spec, 16);
     for lane in 0..50 {
         let part = Part {
             writer: 1,

@@ -1,46 +1,50 @@
-//! Which transitions a minibatch is made of: [`Sampler`].
+//! Whose random numbers decide which transitions are drawn: [`Sampler`].
 //!
-//! A sampler draws rows of the [`Ring`]; another way to draw is another variant here.
+//! How they decide is the store's [`ItemSelector`](crate::ItemSelector).
 
-use crate::ring::{Ring, Row};
-use rand::{Rng, SeedableRng};
+use crate::ring::{Drawn, Ring};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-/// Draws transitions. Its whole state can be saved and restored: the draws go on as if nothing had happened.
+/// The random numbers of one who samples. Their whole state can be saved and restored: the draws go on as if nothing had happened.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Sampler {
-    /// Every transition in the ring with the same probability, with replacement.
-    Uniform(ChaCha8Rng),
+    /// From one generator.
+    #[serde(rename = "uniform")]
+    Seeded(ChaCha8Rng),
 }
 
 impl Sampler {
-    /// A uniform sampler.
-    pub fn uniform(seed: u64) -> Self {
-        Self::Uniform(ChaCha8Rng::seed_from_u64(seed))
+    /// Those of this seed.
+    pub fn new(seed: u64) -> Self {
+        Self::Seeded(ChaCha8Rng::seed_from_u64(seed))
     }
 
-    /// The first row of a transition.
+    /// Draws transitions of a ring whose draws leave no trace.
     ///
     /// # Panics
     /// If the ring is empty.
-    pub(crate) fn draw(&mut self, ring: &Ring) -> Row {
-        match self {
-            Self::Uniform(rng) => loop {
-                // Rows are uniform, and so are those of them that begin a transition: all but one a segment.
-                let row = ring.nth_row(rng.random_range(0..ring.rows()));
-                if ring.steps_from(ring.slot(row)) > 0 {
-                    return row;
-                }
-            },
-        }
+    pub(crate) fn draw_uniformly(&mut self, ring: &Ring, count: usize) -> Vec<Drawn> {
+        let Self::Seeded(rng) = self;
+        (0..count).map(|_| ring.draw_uniformly(rng)).collect()
+    }
+
+    /// Draws transitions as the ring's sampler does.
+    ///
+    /// # Panics
+    /// If there are not so many draws left.
+    pub(crate) fn draw(&mut self, ring: &mut Ring, count: usize) -> Vec<Drawn> {
+        let Self::Seeded(rng) = self;
+        (0..count).map(|_| ring.draw(rng)).collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::ReplayConfig;
     use crate::fixtures;
 
     /// Chi-square of `counts` against a uniform distribution, as a number of standard deviations.
@@ -54,14 +58,14 @@ mod tests {
     #[test]
     fn every_transition_is_drawn_with_the_same_probability_also_after_the_ring_has_wrapped() {
         let spec = fixtures::spec(8);
-        let mut ring = Ring::new(&spec, 100);
+        let mut ring = Ring::new(&spec, &ReplayConfig { capacity: 100, ..ReplayConfig::default() });
         for (i, steps) in [8, 1, 3, 8, 2, 5].into_iter().cycle().take(60).enumerate() {
             ring.push(&fixtures::segment(&spec, 1, i as u64 + 1, steps));
         }
         let mut counts = vec![0; ring.rows() as usize];
-        let mut sampler = Sampler::uniform(3);
-        for _ in 0..200_000 {
-            counts[(sampler.draw(&ring).number() - ring.nth_row(0).number()) as usize] += 1;
+        let mut sampler = Sampler::new(3);
+        for drawn in sampler.draw_uniformly(&ring, 200_000) {
+            counts[(drawn.row.number() - ring.nth_row(0).number()) as usize] += 1;
         }
         let begins = |i: &usize| ring.steps_from(ring.slot(ring.nth_row(*i as u64))) > 0;
         let drawn: Vec<u32> = (0..counts.len()).filter(begins).map(|i| counts[i]).collect();
@@ -73,16 +77,12 @@ mod tests {
     #[test]
     fn a_restored_sampler_goes_on_with_the_same_draws() {
         let spec = fixtures::spec(8);
-        let mut ring = Ring::new(&spec, 100);
+        let mut ring = Ring::new(&spec, &ReplayConfig { capacity: 100, ..ReplayConfig::default() });
         ring.push(&fixtures::segment(&spec, 1, 1, 8));
-        let mut sampler = Sampler::uniform(7);
-        for _ in 0..13 {
-            sampler.draw(&ring);
-        }
+        let mut sampler = Sampler::new(7);
+        sampler.draw_uniformly(&ring, 13);
         let saved = serde_json::to_string(&sampler).unwrap();
         let mut restored: Sampler = serde_json::from_str(&saved).unwrap();
-        for _ in 0..50 {
-            assert_eq!(restored.draw(&ring), sampler.draw(&ring));
-        }
+        assert_eq!(restored.draw_uniformly(&ring, 50), sampler.draw_uniformly(&ring, 50));
     }
 }

@@ -87,7 +87,7 @@ impl LocalSource {
         store.check_options(&options)?;
         let id = NEXT.fetch_add(1, Ordering::Relaxed);
         store.gate().sampler_came(id, name);
-        Ok(Self { store, sampler: Sampler::uniform(options.seed), options, shutdown, id, wait: None })
+        Ok(Self { store, sampler: Sampler::new(options.seed), options, shutdown, id, wait: None })
     }
 
     /// The sampler's state, to be saved in a checkpoint.

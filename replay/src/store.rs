@@ -11,8 +11,8 @@ use crate::gather::gather;
 use crate::limiter::Limiter;
 use crate::log::{self, Log, State, Watermark};
 use crate::metrics::ReplayMetrics;
-use crate::minibatch::{MAX_N_STEP, Minibatch, OptionsError, ReplayCounters, SampleOptions};
-use crate::ring::Ring;
+use crate::minibatch::{Item, MAX_N_STEP, Minibatch, OptionsError, ReplayCounters, SampleOptions};
+use crate::ring::{Drawn, Ring};
 use crate::sampler::Sampler;
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment, columns, v1};
 use getup_telemetry::{Shutdown, Waits};
@@ -34,6 +34,8 @@ pub struct Store {
     /// Names the store.
     id: u64,
     capacity: usize,
+    /// Whether draws change the ring.
+    selects: bool,
     /// Locked by one append at a time, for as long as the disk takes.
     log: Mutex<Writing>,
     /// Locked briefly.
@@ -73,10 +75,12 @@ impl Store {
         spec.validate()?;
         config.validate_for(spec)?;
         let started = Instant::now();
-        let mut ring = Ring::new(spec, config.capacity);
+        let mut ring = Ring::new(spec, config);
         let log = Log::open(dir, spec, config, |segment| ring.push(segment))?;
         let (state, sampled) = (log.state(), log.watermark().sampled()?);
+        ring.set_stored(state.transitions);
         let mut limiter = Limiter::new(config, spec);
+        limiter.set_available(ring.available());
         limiter.restore(state.env_steps, sampled);
         if state.segments > 0 {
             tracing::info!(
@@ -103,6 +107,7 @@ impl Store {
             spec: spec.clone(),
             id: log.store(),
             capacity: config.capacity,
+            selects: ring.selects(),
             watermark: log.watermark().clone(),
             log: Mutex::new(Writing { log, disk_measured: started }),
             memory: RwLock::new(Memory { ring, state }),
@@ -231,11 +236,11 @@ impl Store {
             }
             memory.state = state;
             self.metrics.transitions.set(memory.ring.len() as i64);
+            // Told under the lock: a sampler that comes next must not see more than there is.
+            self.gate.insert(&fresh, memory.ring.available());
         }
         let count = |of: fn(&Segment) -> u64| fresh.iter().copied().map(of).sum::<u64>();
         let env_steps = count(|segment| u64::from(segment.env_steps));
-        self.gate.insert(&fresh);
-
         self.metrics.inserted_env_steps.inc_by(env_steps);
         self.metrics.inserted_transitions.inc_by(count(|segment| segment.steps as u64));
         self.metrics.episodes.inc_by(count(|segment| u64::from(segment.end.is_some())));
@@ -313,17 +318,46 @@ impl Store {
             sampled = total;
             self.watermark.set_sampled(total)
         };
-        if !self.gate.try_sample(options.batch as u64, count)? {
-            return Ok(None);
-        }
-        let memory = self.memory();
-        let columns = gather(&memory.ring, sampler, options);
-        let counters = self.counters_of(memory.state, sampled);
-        drop(memory);
+        let (columns, items, state) = if self.selects {
+            let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
+            if !self.gate.try_sample(options.batch as u64, count)? {
+                return Ok(None);
+            }
+            let drawn = sampler.draw(&mut memory.ring, options.batch);
+            self.gate.set_available(memory.ring.available());
+            let ring = &memory.ring;
+            let item =
+                |drawn: &Drawn| Item { key: ring.key(drawn.row), probability: drawn.probability as f32 };
+            (gather(ring, &drawn, options), drawn.iter().map(item).collect(), memory.state)
+        } else {
+            if !self.gate.try_sample(options.batch as u64, count)? {
+                return Ok(None);
+            }
+            let memory = self.memory();
+            let drawn = sampler.draw_uniformly(&memory.ring, options.batch);
+            (gather(&memory.ring, &drawn, options), Vec::new(), memory.state)
+        };
+        let counters = self.counters_of(state, sampled);
         self.metrics.sampled.inc_by(options.batch as u64);
         self.metrics.sample_seconds.observe(started.elapsed().as_secs_f64());
         self.show_limiter();
-        Ok(Some(Minibatch { columns, counters }))
+        Ok(Some(Minibatch { columns, items, counters }))
+    }
+
+    /// Gives transitions priorities, by their keys; returns how many were there to get them. A priority of 0 is the
+    /// least there is, and does not remove a transition.
+    ///
+    /// # Errors
+    /// [`OptionsError::Priority`] with the first that is negative or not finite: then none is given.
+    pub fn update_priorities(&self, priorities: &[(u64, f32)]) -> Result<u64, OptionsError> {
+        if let Some(&(key, priority)) =
+            priorities.iter().find(|(_, priority)| !(priority.is_finite() && *priority >= 0.0))
+        {
+            return Err(OptionsError::Priority { key, priority });
+        }
+        let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
+        let given = priorities.iter().filter(|&&(key, priority)| memory.ring.set_priority(key, priority));
+        Ok(given.count() as u64)
     }
 
     /// Totals over the store's life.

@@ -108,7 +108,7 @@ fn compacting_keeps_the_newest_the_totals_and_the_marks() {
     let settings = ReplayConfig { capacity: 10_000, ..config() };
     let store = open(dir.path(), &spec(STEPS), &settings).unwrap();
     store.append(vec![segment(&spec(STEPS), 77, 5, STEPS)]).unwrap();
-    let mut sampler = Sampler::uniform(1);
+    let mut sampler = Sampler::new(1);
     for sequence in 1..=200 {
         store.append(vec![segment(&spec(STEPS), 1, sequence, STEPS)]).unwrap();
     }

@@ -141,7 +141,7 @@ proptest! {
         let dir = TempDir::new().unwrap();
         let settings = ReplayConfig { capacity, ..config() };
         let mut store = open(dir.path(), &spec(STEPS), &settings).unwrap();
-        let (mut model, mut writers, mut sampler) = (Model::default(), Writers::default(), Sampler::uniform(1));
+        let (mut model, mut writers, mut sampler) = (Model::default(), Writers::default(), Sampler::new(1));
         for action in actions {
             match action {
                 Action::Append(parts) => {

@@ -10,7 +10,7 @@ use tempfile::TempDir;
 
 /// Minibatches of the store, drawn from a fixed seed.
 fn drawn(store: &Store, count: usize) -> Vec<Minibatch> {
-    let mut sampler = Sampler::uniform(11);
+    let mut sampler = Sampler::new(11);
     let options = SampleOptions { n_step: 3, ..options(64) };
     (0..count).map(|_| store.try_sample(&mut sampler, &options).unwrap().unwrap()).collect()
 }
@@ -128,7 +128,7 @@ fn one_thread_can_insert_and_sample_in_a_fixed_order() {
         let paced =
             ReplayConfig { min_size: 8, samples_per_insert: Some(8.0), error_buffer: Some(64.0), ..config() };
         let store = open(dir.path(), &spec(4), &paced).unwrap();
-        let mut sampler = Sampler::uniform(2);
+        let mut sampler = Sampler::new(2);
         let mut columns = Vec::new();
         for sequence in 1..=50 {
             assert!(store.can_insert(4));

@@ -59,7 +59,7 @@ pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Sta
     let mut turns = Turns {
         evaluator: Evaluator::new(&config.task, config.control_limit(), config.evaluation.episodes)?,
         lanes: LaneGroup::new(settings, 0, config.actor.lanes, policy)?,
-        sampler: Sampler::uniform(options.seed),
+        sampler: Sampler::new(options.seed),
         name: config.actor.name.clone(),
         sequence: 0,
         options,

@@ -158,6 +158,27 @@ impl Replay for Service {
         described.map(Response::new).map_err(|error| Status::internal(error.to_string()))
     }
 
+    async fn update_priorities(
+        &self,
+        request: Request<v1::UpdatePrioritiesRequest>,
+    ) -> Result<Response<v1::UpdatePrioritiesReply>, Status> {
+        let v1::UpdatePrioritiesRequest { keys, priorities } = request.into_inner();
+        if keys.len() != priorities.len() {
+            let (keys, priorities) = (keys.len(), priorities.len());
+            return Err(Status::invalid_argument(format!(
+                "{keys} keys came with {priorities} priorities: pair them"
+            )));
+        }
+        let store = self.store.clone();
+        let updating = tokio::task::spawn_blocking(move || {
+            store.update_priorities(&keys.into_iter().zip(priorities).collect::<Vec<_>>())
+        });
+        match updating.await.map_err(|error| Status::internal(error.to_string()))? {
+            Ok(updated) => Ok(Response::new(v1::UpdatePrioritiesReply { updated })),
+            Err(error) => Err(Status::invalid_argument(error.to_string())),
+        }
+    }
+
     async fn snapshot(
         &self,
         request: Request<v1::SnapshotRequest>,

@@ -8,7 +8,7 @@ use getup_proto::v1::append_request::Message;
 use getup_proto::v1::replay_server::{Replay, ReplayServer};
 use getup_proto::v1::{
     AppendReply, AppendRequest, DescribeReply, DescribeRequest, SampleReply, SampleRequest, SnapshotReply,
-    SnapshotRequest,
+    SnapshotRequest, UpdatePrioritiesReply, UpdatePrioritiesRequest,
 };
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment};
 use tokio_stream::{Stream, StreamExt};
@@ -115,6 +115,13 @@ impl Replay for Store {
     }
 
     async fn describe(&self, _: Request<DescribeRequest>) -> Result<Response<DescribeReply>, Status> {
+        Err(Status::unimplemented("this replay only stores"))
+    }
+
+    async fn update_priorities(
+        &self,
+        _: Request<UpdatePrioritiesRequest>,
+    ) -> Result<Response<UpdatePrioritiesReply>, Status> {
         Err(Status::unimplemented("this replay only stores"))
     }
 

@@ -1,0 +1,179 @@
+//! Stores that draw otherwise than uniformly, in process and over gRPC.
+
+mod common;
+mod fixtures;
+
+use common::{PATIENCE, Replay, config, eventually, open, options};
+use fixtures::{segment, spec, value};
+use getup_replay::{
+    ItemSelector, Minibatch, MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, Sampler, Store,
+    describe, update_priorities,
+};
+use std::time::Duration;
+use tempfile::TempDir;
+
+const STEPS: usize = 8;
+
+fn filled(store: &Store, sequences: std::ops::RangeInclusive<u64>) {
+    store.append(sequences.map(|i| segment(&spec(STEPS), 1, i, STEPS)).collect()).unwrap();
+}
+
+/// Which transitions these are, as sequence number and step: the fixtures' values say so.
+fn origins(minibatch: &Minibatch) -> Vec<(u64, usize)> {
+    let observations = &minibatch.column("observation").unwrap().data;
+    let origin = |observation: &[f32]| {
+        let all = (1..=60).flat_map(|sequence| (0..STEPS).map(move |step| (sequence, step)));
+        let is = |&(sequence, step): &(u64, usize)| observation[0] == value(1, 0, sequence, step, 0, 0);
+        let mut found = all.filter(is);
+        found.next().unwrap()
+    };
+    observations.chunks(3).map(origin).collect()
+}
+
+#[test]
+fn a_queue_hands_out_each_transition_once_in_order_and_waits_on_both_sides() {
+    // At most 64 transitions ahead of whoever takes them.
+    let queue = ReplayConfig {
+        sampler: ItemSelector::Fifo,
+        max_times_sampled: Some(1),
+        samples_per_insert: Some(1.0),
+        error_buffer: Some(64.0),
+        ..config()
+    };
+    let replay = Replay::start(spec(STEPS), &queue);
+    let mut writer = replay.writer(1);
+    let sending = replay.runtime.spawn(async move {
+        for sequence in 1..=50 {
+            writer.send(&segment(&spec(STEPS), 1, sequence, STEPS)).await.unwrap();
+        }
+        writer.acknowledged(50).await.unwrap();
+    });
+    eventually("the writer waits", || waiting(&replay).starts_with("writer waits"));
+    assert_eq!(replay.store.counters().env_steps, 64);
+    let mut source = source(&replay, 16);
+    let mut taken = Vec::new();
+    for _ in 0..25 {
+        taken.extend(origins(&source.next().unwrap()));
+    }
+    let all = (1..=50).flat_map(|sequence| (0..STEPS).map(move |step| (sequence, step)));
+    assert_eq!(taken, all.collect::<Vec<_>>());
+    replay.runtime.block_on(async { tokio::time::timeout(PATIENCE, sending).await }).unwrap().unwrap();
+    // Everything was taken.
+    assert!(source.poll(Duration::from_millis(100)).unwrap().is_none());
+    eventually("the sampler waits", || {
+        waiting(&replay).contains("0 of 16 transitions that were not sampled as often as they may be")
+    });
+}
+
+fn waiting(replay: &Replay) -> String {
+    replay.runtime.block_on(describe(&replay.endpoint)).unwrap().limiter.unwrap().waiting
+}
+
+fn source(replay: &Replay, batch: usize) -> RemoteSource {
+    let options = RemoteOptions {
+        endpoint: replay.endpoint.clone(),
+        spec: replay.spec.clone(),
+        sample: options(batch),
+        name: "learner".to_owned(),
+        prefetch: 2,
+    };
+    RemoteSource::new(options, replay.runtime.handle(), replay.waits.clone(), replay.shutdown.clone())
+}
+
+#[test]
+fn lifo_hands_out_the_newest() {
+    let dir = TempDir::new().unwrap();
+    let newest =
+        ReplayConfig { sampler: ItemSelector::Lifo, max_times_sampled: Some(1), capacity: 100, ..config() };
+    let store = open(dir.path(), &spec(STEPS), &newest).unwrap();
+    let mut sampler = Sampler::new(1);
+    filled(&store, 1..=40);
+    let mut taken = origins(&store.try_sample(&mut sampler, &options(10)).unwrap().unwrap());
+    filled(&store, 41..=41);
+    taken.extend(origins(&store.try_sample(&mut sampler, &options(8)).unwrap().unwrap()));
+    let down = |sequence| (0..STEPS).rev().map(move |step| (sequence, step));
+    let expected: Vec<_> = down(40).chain(down(39)).take(10).chain(down(41)).collect();
+    assert_eq!(taken, expected);
+}
+
+#[test]
+fn priorities_move_the_draws_and_weights_make_up_for_them() {
+    let prioritized = ReplayConfig { sampler: ItemSelector::Prioritized { exponent: 1.0 }, ..config() };
+    let replay = Replay::start(spec(STEPS), &prioritized);
+    filled(&replay.store, 1..=10);
+    let mut source = source(&replay, 64);
+    let first = source.next().unwrap();
+    // All have the same priority at first.
+    assert!(first.items.iter().all(|item| (item.probability - 1.0 / 80.0).abs() < 1e-6));
+    assert!(first.importance_weights(0.4).iter().all(|&weight| weight == 1.0));
+    // Keys say which transition it is.
+    let keys: Vec<u64> =
+        origins(&first).iter().map(|&(i, step)| (i - 1) * STEPS as u64 + step as u64).collect();
+    assert_eq!(first.items.iter().map(|item| item.key).collect::<Vec<_>>(), keys);
+
+    // Of the transitions 0 to 79, number 10 is worth as much as nine, and all after 19 nothing.
+    let priorities: Vec<(u64, f32)> = (0..80)
+        .map(|key| {
+            (
+                key,
+                if key == 10 {
+                    9.0
+                } else if key < 20 {
+                    1.0
+                } else {
+                    0.0
+                },
+            )
+        })
+        .collect();
+    let update =
+        |priorities: &[(u64, f32)]| replay.runtime.block_on(update_priorities(&replay.endpoint, priorities));
+    assert_eq!(update(&priorities).unwrap(), 80);
+    assert_eq!(update(&[(80, 1.0), (u64::MAX, 1.0)]).unwrap(), 0);
+    let refused = update(&[(0, 0.5), (1, f32::NAN)]).unwrap_err();
+    assert!(refused.message().contains("priority of transition 1 is NaN"), "{refused}");
+
+    let mut sampler = Sampler::new(3);
+    let mut counts = [0.0_f64; 80];
+    for _ in 0..400 {
+        let minibatch = replay.store.try_sample(&mut sampler, &options(64)).unwrap().unwrap();
+        let weights = minibatch.importance_weights(1.0);
+        for (item, weight) in minibatch.items.iter().zip(weights) {
+            counts[item.key as usize] += 1.0;
+            let expected = if item.key == 10 { 9.0 / 28.0 } else { 1.0 / 28.0 };
+            assert!((item.probability - expected).abs() < 1e-6, "{item:?}");
+            assert!((weight - if item.key == 10 { 1.0 / 9.0 } else { 1.0 }).abs() < 1e-6);
+        }
+    }
+    let draws = 400.0 * 64.0;
+    let chi_square: f64 = (0..20)
+        .map(|key| {
+            let expected = draws * if key == 10 { 9.0 } else { 1.0 } / 28.0;
+            (counts[key] - expected).powi(2) / expected
+        })
+        .sum();
+    // 19 degrees of freedom: above 50 once in eight thousand seeds.
+    assert!(chi_square < 50.0, "{chi_square}");
+    assert_eq!(counts[20..], [0.0; 60]);
+}
+
+#[test]
+fn keys_are_the_same_after_a_restart_and_after_evictions() {
+    let dir = TempDir::new().unwrap();
+    let settings =
+        ReplayConfig { sampler: ItemSelector::Prioritized { exponent: 0.6 }, capacity: 100, ..config() };
+    let store = open(dir.path(), &spec(STEPS), &settings).unwrap();
+    filled(&store, 1..=60);
+    drop(store);
+    let store = open(dir.path(), &spec(STEPS), &settings).unwrap();
+    let minibatch = store.try_sample(&mut Sampler::new(1), &options(50)).unwrap().unwrap();
+    for (item, (sequence, step)) in minibatch.items.iter().zip(origins(&minibatch)) {
+        assert_eq!(item.key, (sequence - 1) * STEPS as u64 + step as u64);
+    }
+    // Evicted long ago, the oldest that is there, and one that is to come.
+    let oldest = 480 - store.len() as u64;
+    assert_eq!(
+        store.update_priorities(&[(0, 1.0), (oldest - 1, 1.0), (oldest, 1.0), (480, 1.0)]).unwrap(),
+        1
+    );
+}
