@@ -189,7 +189,7 @@ fn memory_row(runtime: &Runtime, service: &Service, peer: &mut Reverb) -> Result
 fn snapshot_row(runtime: &Runtime, service: &Service) -> Result<Row> {
     let mut longest: f64 = 0.0;
     for n in 0..10 {
-        let taken = runtime.block_on(take_snapshot(&service.endpoint, &format!("bench-{n}")));
+        let taken = runtime.block_on(take_snapshot(&service.endpoint, "", &format!("bench-{n}")));
         longest = longest.max(1e3 * taken.map_err(anyhow::Error::from)?.paused_seconds);
     }
     let name = "snapshot, 1 M transitions, longest pause".to_owned();
@@ -373,6 +373,7 @@ fn sample(runtime: &Runtime, endpoint: &str, spec: &RunSpec, batch: usize) -> Re
         spec: spec.clone(),
         sample: SampleOptions { batch, n_step: 1, gamma: 0.97, seed: 1 },
         name: "benchmark".to_owned(),
+        table: String::new(),
         prefetch: PREFETCH,
     };
     let mut source =

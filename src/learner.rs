@@ -77,6 +77,7 @@ async fn serve(
         spec: config.run_spec()?,
         sample: sample_options(config, incarnation),
         name: "learner".into(),
+        table: String::new(),
         prefetch: PREFETCH,
     };
     let runtime = tokio::runtime::Handle::current();

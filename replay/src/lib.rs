@@ -18,6 +18,7 @@
 //! | `sampler` | [`Sampler`]: whose random numbers decide |
 //! | `limiter` | Reverb's cursor between two bounds, a pure state machine |
 //! | `gate` | the limiter with its doors: who waits there, and for whom |
+//! | `tables` | [`Tables`]: stores by name, behind one address |
 //! | `service` | [`serve`]: the streams of writers and samplers |
 //! | `source`, `remote` | [`MinibatchSource`], in process and over gRPC; [`describe`] |
 //! | `export` | a store's transitions for other tools |
@@ -40,6 +41,7 @@ mod service;
 mod source;
 mod store;
 mod sum_tree;
+mod tables;
 
 #[cfg(test)]
 #[path = "../tests/fixtures/mod.rs"]
@@ -53,9 +55,10 @@ pub use metrics::ReplayMetrics;
 pub use minibatch::{
     Item, MAX_N_STEP, Minibatch, MinibatchColumn, OptionsError, ReplayCounters, SampleOptions,
 };
-pub use remote::{RemoteOptions, RemoteSource, describe, take_snapshot, update_priorities};
+pub use remote::{RemoteOptions, RemoteSource, describe, describe_table, take_snapshot, update_priorities};
 pub use sampler::Sampler;
 pub use selector::ItemSelector;
 pub use service::{ServeError, serve};
 pub use source::{LocalSource, MinibatchSource, SampleError};
 pub use store::Store;
+pub use tables::{DEFAULT_TABLE, TableError, Tables, check_table_name};

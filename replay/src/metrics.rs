@@ -1,5 +1,6 @@
 //! What `/metrics` says of a replay: [`ReplayMetrics`], all names `getup_replay_…`.
 
+use crate::tables::DEFAULT_TABLE;
 use getup_telemetry::prometheus::{
     Gauge, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry, core::Collector,
     exponential_buckets,
@@ -27,27 +28,38 @@ pub struct ReplayMetrics {
 }
 
 impl ReplayMetrics {
-    /// Registers the metrics.
+    /// Registers the metrics of the default table.
     ///
     /// # Panics
-    /// When the registry has a replay's metrics already.
+    /// When the registry has them already.
     pub fn new(registry: &Registry) -> Self {
+        Self::of_table(registry, DEFAULT_TABLE)
+    }
+
+    /// Registers the metrics of a table: they carry its name as the label `table`.
+    ///
+    /// # Panics
+    /// When the registry has them already.
+    pub fn of_table(registry: &Registry, table: &str) -> Self {
+        let options = |name: &str, help: &str| {
+            Opts::new(format!("getup_replay_{name}"), help).const_label("table", table)
+        };
         let gauge = |name: &str, help: &str| {
-            added(registry, IntGauge::new(format!("getup_replay_{name}"), help).expect(WELL_FORMED))
+            added(registry, IntGauge::with_opts(options(name, help)).expect(WELL_FORMED))
         };
         // Counters begin at the totals of earlier processes.
         let counter = |name: &str, help: &str| {
-            added(registry, IntCounter::new(format!("getup_replay_{name}"), help).expect(WELL_FORMED))
+            added(registry, IntCounter::with_opts(options(name, help)).expect(WELL_FORMED))
         };
         let float = |name: &str, help: &str| {
-            added(registry, Gauge::new(format!("getup_replay_{name}"), help).expect(WELL_FORMED))
+            added(registry, Gauge::with_opts(options(name, help)).expect(WELL_FORMED))
         };
         let histogram = |name: &str, help: &str, start, factor, count| {
             let buckets = exponential_buckets(start, factor, count).expect(WELL_FORMED);
-            let options = HistogramOpts::new(format!("getup_replay_{name}"), help).buckets(buckets);
+            let options = HistogramOpts { common_opts: options(name, help), buckets };
             added(registry, Histogram::with_opts(options).expect(WELL_FORMED))
         };
-        let rejected = Opts::new("getup_replay_rejected_total", "Appends and samples refused, by reason.");
+        let rejected = options("rejected_total", "Appends and samples refused, by reason.");
         let rejected = IntCounterVec::new(rejected, &["reason"]).expect(WELL_FORMED);
         Self {
             transitions: gauge("transitions", "Transitions that can be sampled now."),
@@ -93,6 +105,8 @@ impl ReplayMetrics {
 const WELL_FORMED: &str = "names, labels and buckets are well-formed";
 
 fn added<C: Collector + Clone + 'static>(registry: &Registry, collector: C) -> C {
-    registry.register(Box::new(collector.clone())).expect("a process has one replay");
+    registry
+        .register(Box::new(collector.clone()))
+        .expect("a process has one replay, and a table one set of metrics");
     collector
 }

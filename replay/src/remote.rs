@@ -48,7 +48,9 @@ pub struct RemoteSource {
 pub struct RemoteOptions {
     /// Where the service listens, as `host:port`.
     pub endpoint: String,
-    /// The run's spec: a service with another refuses.
+    /// The table that is sampled; empty for the default.
+    pub table: String,
+    /// The table's spec: a service with another refuses.
     pub spec: RunSpec,
     /// What minibatches are made of.
     pub sample: SampleOptions,
@@ -119,39 +121,54 @@ impl MinibatchSource for RemoteSource {
     }
 }
 
-/// What the service says of its store.
+/// What the service says of its default table.
 ///
 /// # Errors
 /// UNAVAILABLE if the service is not there, DEADLINE_EXCEEDED if it does not answer.
 pub async fn describe(endpoint: &str) -> Result<v1::DescribeReply, Status> {
-    let channel = connect(endpoint).await.map_err(|error| Status::unavailable(error.to_string()))?;
-    ask(ReplayClient::new(channel)).await
+    describe_table(endpoint, "").await
 }
 
-/// Gives transitions of a service's store priorities, by their keys; returns how many were still there.
+/// What the service says of one of its tables.
+///
+/// # Errors
+/// As [`describe`]; NOT_FOUND if it has no such table.
+pub async fn describe_table(endpoint: &str, table: &str) -> Result<v1::DescribeReply, Status> {
+    let channel = connect(endpoint).await.map_err(|error| Status::unavailable(error.to_string()))?;
+    ask(ReplayClient::new(channel), table).await
+}
+
+/// Gives transitions of a service's table (empty for the default) priorities, by their keys; returns how many were still there.
 ///
 /// # Errors
 /// As [`describe`]; INVALID_ARGUMENT if one is negative or not finite, and then none is given.
-pub async fn update_priorities(endpoint: &str, priorities: &[(u64, f32)]) -> Result<u64, Status> {
+pub async fn update_priorities(
+    endpoint: &str,
+    table: &str,
+    priorities: &[(u64, f32)],
+) -> Result<u64, Status> {
     let channel = connect(endpoint).await.map_err(|error| Status::unavailable(error.to_string()))?;
     let (keys, priorities) = priorities.iter().copied().unzip();
     let mut client = ReplayClient::new(channel).max_encoding_message_size(MAX_MESSAGE_BYTES);
-    let reply = client.update_priorities(v1::UpdatePrioritiesRequest { keys, priorities }).await?;
+    let reply = client
+        .update_priorities(v1::UpdatePrioritiesRequest { keys, priorities, table: table.to_owned() })
+        .await?;
     Ok(reply.into_inner().updated)
 }
 
-/// Has the service copy its store to `snapshots/NAME` in its folder.
+/// Has the service copy the store of a table (empty for the default) to `snapshots/NAME` in its folder.
 ///
 /// # Errors
 /// As [`describe`]; INVALID_ARGUMENT if the name is none, FAILED_PRECONDITION if the copy cannot be made.
-pub async fn take_snapshot(endpoint: &str, name: &str) -> Result<v1::SnapshotReply, Status> {
+pub async fn take_snapshot(endpoint: &str, table: &str, name: &str) -> Result<v1::SnapshotReply, Status> {
     let channel = connect(endpoint).await.map_err(|error| Status::unavailable(error.to_string()))?;
-    let request = v1::SnapshotRequest { name: name.to_owned() };
+    let request = v1::SnapshotRequest { name: name.to_owned(), table: table.to_owned() };
     ReplayClient::new(channel).snapshot(request).await.map(tonic::Response::into_inner)
 }
 
-async fn ask(mut client: ReplayClient<Channel>) -> Result<v1::DescribeReply, Status> {
-    let answer = tokio::time::timeout(CALL_PATIENCE, client.describe(v1::DescribeRequest {})).await;
+async fn ask(mut client: ReplayClient<Channel>, table: &str) -> Result<v1::DescribeReply, Status> {
+    let request = v1::DescribeRequest { table: table.to_owned() };
+    let answer = tokio::time::timeout(CALL_PATIENCE, client.describe(request)).await;
     answer.map_err(|_| Status::deadline_exceeded("replay does not answer"))?.map(tonic::Response::into_inner)
 }
 
@@ -265,7 +282,7 @@ impl Fetching {
                     }
                 },
                 _ = asked_why.tick(), if self.queued == 0 => {
-                    if let Ok(described) = ask(ReplayClient::new(channel.clone())).await {
+                    if let Ok(described) = ask(ReplayClient::new(channel.clone()), &self.options.table).await {
                         let waiting = described.limiter.map(|limiter| limiter.waiting).unwrap_or_default();
                         let default = || format!("minibatches from replay at {}", self.options.endpoint);
                         self.explain(if waiting.is_empty() { default() } else { waiting });
@@ -286,6 +303,7 @@ impl Fetching {
             // A stream that replaces another must not draw the same again.
             seed: seed.wrapping_add((self.streams - 1).wrapping_mul(0x9e37_79b9_7f4a_7c15)),
             name: self.options.name.clone(),
+            table: self.options.table.clone(),
         }
     }
 
@@ -329,6 +347,7 @@ impl From<Status> for End {
         match status.code() {
             Code::InvalidArgument
             | Code::FailedPrecondition
+            | Code::NotFound
             | Code::Unimplemented
             | Code::Unauthenticated
             | Code::PermissionDenied

@@ -402,6 +402,8 @@ impl Store {
                 waiting: self.gate.waiting(),
             }),
             writers,
+            // Whoever serves it knows.
+            tables: Vec::new(),
         }
     }
 

@@ -122,6 +122,7 @@ fn source(replay: &Replay, batch: usize) -> RemoteSource {
         spec: replay.spec.clone(),
         sample: options(batch),
         name: "learner".to_owned(),
+        table: String::new(),
         prefetch: 4,
     };
     RemoteSource::new(options, replay.runtime.handle(), replay.waits.clone(), replay.shutdown.clone())
@@ -139,6 +140,7 @@ fn a_client_that_stops_reading_delays_nobody_and_costs_no_memory() {
         gamma: 0.9,
         seed: 1,
         name: "greedy".to_owned(),
+        table: String::new(),
     };
     let (requests, outbound) = mpsc::channel(4);
     for message in [v1::sample_request::Message::Hello(hello), v1::sample_request::Message::Credits(u32::MAX)]

@@ -97,6 +97,7 @@ fn requests_are_parsed_or_refused() {
         gamma: 0.9,
         seed: 1,
         name: "learner".to_owned(),
+        table: String::new(),
     };
     let sample =
         v1::SampleRequest { message: Some(v1::sample_request::Message::Hello(hello)) }.encode_to_vec();
@@ -141,7 +142,8 @@ fn stored_files_are_read_or_named_as_damaged() {
     let valid = fs::read(&path).unwrap();
     let mut damaged = 0;
     // A survey opens sled too: slower than the parsers by far.
-    for _ in 0..inputs() / 10 {
+    let files = (inputs() / 10).min(5_000);
+    for _ in 0..files {
         fs::write(&path, mangled(&mut rng, &valid)).unwrap();
         let mut segments = 0;
         let survey = Survey::read(dir.path(), |_| segments += 1).unwrap();
@@ -149,5 +151,5 @@ fn stored_files_are_read_or_named_as_damaged() {
         assert!(segments <= 12);
         damaged += u64::from(!survey.damages.is_empty());
     }
-    assert!(damaged > inputs() / 40, "{damaged}: the inputs reach nothing");
+    assert!(damaged > files / 4, "{damaged}: the inputs reach nothing");
 }

@@ -125,6 +125,7 @@ fn sampler(endpoint: &str, runtime: &tokio::runtime::Runtime) -> RemoteSource {
         spec: spec(STEPS),
         sample: common::options(32),
         name: "learner".to_owned(),
+        table: String::new(),
         prefetch: 2,
     };
     RemoteSource::new(options, runtime.handle(), Waits::new(&Registry::new()), Shutdown::new())

@@ -153,14 +153,15 @@ fn a_snapshot_of_a_store_under_load_is_a_store_of_one_moment() {
     let mut taken = Vec::new();
     for name in ["first", "second", "third"] {
         let before = replay.store.counters().transitions;
-        let reply = replay.runtime.block_on(take_snapshot(&replay.endpoint, name)).unwrap();
+        let reply = replay.runtime.block_on(take_snapshot(&replay.endpoint, "", name)).unwrap();
         let counters = reply.counters.unwrap();
         assert!((before..=replay.store.counters().transitions).contains(&counters.transitions));
         assert_ne!(counters.transitions, 0);
         taken.push((PathBuf::from(reply.path), counters));
         eventually("more was appended", || replay.store.counters().transitions > counters.transitions + 500);
     }
-    let refused = |name: &str| replay.runtime.block_on(take_snapshot(&replay.endpoint, name)).unwrap_err();
+    let refused =
+        |name: &str| replay.runtime.block_on(take_snapshot(&replay.endpoint, "", name)).unwrap_err();
     for (name, code) in
         [("first", Code::FailedPrecondition), ("", Code::InvalidArgument), ("../up", Code::InvalidArgument)]
     {

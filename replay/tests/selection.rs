@@ -4,13 +4,21 @@ mod common;
 mod fixtures;
 
 use common::{PATIENCE, Replay, config, eventually, open, options};
-use fixtures::{segment, spec, value};
+use fixtures::{get_up_spec, segment, spec, value};
+use getup_proto::v1::append_request::Message;
+use getup_proto::v1::replay_client::ReplayClient;
+use getup_proto::{RunSpec, v1};
 use getup_replay::{
     ItemSelector, Minibatch, MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, Sampler, Store,
-    describe, update_priorities,
+    TableError, Tables, describe, describe_table, serve, update_priorities,
 };
+use getup_telemetry::{Registry, Shutdown, Waits};
+use std::sync::Arc;
 use std::time::Duration;
 use tempfile::TempDir;
+use tokio::net::TcpListener;
+use tokio::runtime::Runtime;
+use tonic::{Code, Status};
 
 const STEPS: usize = 8;
 
@@ -75,6 +83,7 @@ fn source(replay: &Replay, batch: usize) -> RemoteSource {
         spec: replay.spec.clone(),
         sample: options(batch),
         name: "learner".to_owned(),
+        table: String::new(),
         prefetch: 2,
     };
     RemoteSource::new(options, replay.runtime.handle(), replay.waits.clone(), replay.shutdown.clone())
@@ -126,8 +135,9 @@ fn priorities_move_the_draws_and_weights_make_up_for_them() {
             )
         })
         .collect();
-    let update =
-        |priorities: &[(u64, f32)]| replay.runtime.block_on(update_priorities(&replay.endpoint, priorities));
+    let update = |priorities: &[(u64, f32)]| {
+        replay.runtime.block_on(update_priorities(&replay.endpoint, "", priorities))
+    };
     assert_eq!(update(&priorities).unwrap(), 80);
     assert_eq!(update(&[(80, 1.0), (u64::MAX, 1.0)]).unwrap(), 0);
     let refused = update(&[(0, 0.5), (1, f32::NAN)]).unwrap_err();
@@ -176,4 +186,67 @@ fn keys_are_the_same_after_a_restart_and_after_evictions() {
         store.update_priorities(&[(0, 1.0), (oldest - 1, 1.0), (oldest, 1.0), (480, 1.0)]).unwrap(),
         1
     );
+}
+
+#[test]
+fn tables_of_one_service_know_nothing_of_each_other() {
+    let (default, other) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+    let store = |dir: &TempDir, spec: &RunSpec, settings: &ReplayConfig| {
+        Arc::new(open(dir.path(), spec, settings).unwrap())
+    };
+    // Of another spec, sampler and limit.
+    let queue = ReplayConfig { sampler: ItemSelector::Fifo, max_times_sampled: Some(1), ..config() };
+    let (plain, queue) = (store(&default, &spec(STEPS), &config()), store(&other, &get_up_spec(), &queue));
+    let tables = Tables::from(plain.clone()).with("queue", queue.clone()).unwrap();
+    assert!(matches!(tables.clone().with("queue", queue.clone()), Err(TableError::Duplicate(_))));
+    let runtime = Runtime::new().unwrap();
+    let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0")).unwrap();
+    let endpoint = listener.local_addr().unwrap().to_string();
+    let shutdown = Shutdown::new();
+    let serving = runtime.spawn(serve(listener, tables, shutdown.clone()));
+
+    // The same writer's first segment goes to both.
+    let append = |table: &str, spec: &RunSpec, steps| {
+        let hello = v1::AppendHello {
+            spec: Some(spec.to_wire()),
+            writer: 1,
+            name: "actor".to_owned(),
+            table: table.to_owned(),
+        };
+        let messages = [Message::Hello(hello), common::message(&segment(spec, 1, 1, steps))];
+        let requests = messages.map(|message| v1::AppendRequest { message: Some(message) });
+        runtime.block_on(async {
+            let mut client = ReplayClient::connect(format!("http://{endpoint}")).await.unwrap();
+            let mut replies = client.append(tokio_stream::iter(requests)).await?.into_inner();
+            while replies.message().await?.is_some() {}
+            Ok::<_, Status>(())
+        })
+    };
+    append("", &spec(STEPS), STEPS).unwrap();
+    append("queue", &get_up_spec(), 64).unwrap();
+    assert_eq!((plain.len(), queue.len()), (STEPS, 64));
+    let refused = append("queue", &spec(STEPS), STEPS).unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition, "{refused}");
+    let unknown = append("que", &spec(STEPS), STEPS).unwrap_err();
+    assert_eq!(unknown.code(), Code::NotFound);
+    assert!(unknown.message().contains("no table `que` here, but default, queue"), "{unknown}");
+
+    let described = runtime.block_on(describe_table(&endpoint, "queue")).unwrap();
+    assert_eq!((described.size, described.tables), (64, vec!["default".to_owned(), "queue".to_owned()]));
+    let options = RemoteOptions {
+        endpoint: endpoint.clone(),
+        spec: get_up_spec(),
+        sample: options(32),
+        name: "learner".to_owned(),
+        table: "queue".to_owned(),
+        prefetch: 2,
+    };
+    let waits = Waits::new(&Registry::new());
+    let mut source = RemoteSource::new(options, runtime.handle(), waits, shutdown.clone());
+    let taken: Vec<u64> = (0..2).flat_map(|_| source.next().unwrap().items).map(|item| item.key).collect();
+    assert_eq!(taken, (0..64).collect::<Vec<_>>());
+    assert!(source.poll(Duration::from_millis(50)).unwrap().is_none());
+    assert_eq!((plain.counters().sampled, queue.counters().sampled), (0, 64));
+    shutdown.trigger();
+    runtime.block_on(serving).unwrap().unwrap();
 }

@@ -72,7 +72,7 @@ fn what_is_wrong_is_refused_with_its_reason_and_changes_nothing() {
     };
     let mut damaged = second().to_wire();
     damaged.crc32 ^= 1;
-    let mut unspecified = v1::AppendHello { spec: None, writer: 1, name: String::new() };
+    let mut unspecified = v1::AppendHello { spec: None, writer: 1, ..v1::AppendHello::default() };
     unspecified.spec = None;
     use Code::{FailedPrecondition, InvalidArgument};
     let wrong: Vec<(Vec<Message>, Code, &str)> = vec![

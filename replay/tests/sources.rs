@@ -28,6 +28,7 @@ fn remote(replay: &Replay, sample: SampleOptions) -> Result<Box<dyn MinibatchSou
         spec: replay.spec.clone(),
         sample,
         name: "learner".to_owned(),
+        table: String::new(),
         prefetch: 4,
     };
     let runtime = replay.runtime.handle();
@@ -225,6 +226,7 @@ fn a_remote_source_waits_for_the_service_and_comes_back_after_its_restart_with_o
         spec: spec(8),
         sample: options(32),
         name: "learner".to_owned(),
+        table: String::new(),
         prefetch: 1,
     };
     let mut source = RemoteSource::new(options, runtime.handle(), waits.clone(), shutdown);

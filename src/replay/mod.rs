@@ -1,12 +1,13 @@
 //! `getup replay`: the replay as a process, and tools for its store ([`tools`]).
 
+mod tables;
 mod tools;
 
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::Result;
-use getup_replay::{ReplayMetrics, Store, serve};
+use getup_replay::{ReplayMetrics, Store, Tables, serve};
 
 use crate::config::Config;
 use crate::role::{Role, RoleArgs, bind};
@@ -24,6 +25,11 @@ pub(crate) struct Args {
     /// The store's folder. [default: `replay` in the run's folder]
     #[arg(long, value_name = "DIR")]
     dir: Option<PathBuf>,
+    /// A TOML file of further tables, a section each: `[NAME]` with capacity, min_size, samples_per_insert,
+    /// error_buffer, sync, sampler ("uniform", "fifo", "lifo", { prioritized = { exponent = 0.6 } }), max_times_sampled;
+    /// columns and max_segment_steps where they are not the run's.
+    #[arg(long, value_name = "FILE")]
+    tables: Option<PathBuf>,
 }
 
 pub(crate) fn run(arguments: Args) -> Result<()> {
@@ -33,25 +39,32 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let config = arguments.role.config.load()?;
     let role = Role::new("replay", arguments.role.log_format)?;
     let dir = arguments.dir.unwrap_or_else(|| PathBuf::from("runs").join(&config.run).join("replay"));
-    role.run(start(&config, &role, dir))
+    role.run(start(&config, &role, dir, arguments.tables))
 }
 
-async fn start(config: &Config, role: &Role, dir: PathBuf) -> Result<()> {
+async fn start(config: &Config, role: &Role, dir: PathBuf, tables: Option<PathBuf>) -> Result<()> {
     let listener = bind(&config.network.replay, "gRPC").await?;
     role.serve_metrics(&config.network.replay_metrics).await?;
     std::fs::create_dir_all(&dir)?;
     let (spec, settings) = (config.run_spec()?, config.replay_config());
     let metrics = ReplayMetrics::new(&role.registry);
     tracing::info!("replay will serve gRPC at {}, its store is {}", listener.local_addr()?, dir.display());
-    let (waits, folder) = (role.waits.clone(), dir.clone());
+    let (role_here, folder) = (role.clone(), dir.clone());
     let reading = role.waits.begin("replay", format!("the log in {} is read back", dir.display()));
-    let opening = tokio::task::spawn_blocking(move || Store::open(&folder, &spec, &settings, metrics, waits));
-    let store = tokio::select! {
+    let opening = tokio::task::spawn_blocking(move || {
+        let store = Store::open(&folder, &spec, &settings, metrics, role_here.waits.clone())?;
+        let default = Tables::from(Arc::new(store));
+        match tables {
+            Some(file) => tables::open(default, &file, &folder, &spec, &role_here),
+            None => Ok(default),
+        }
+    });
+    let tables = tokio::select! {
         opened = opening => opened??,
         () = role.shutdown.wait() => return Ok(()),
     };
     drop(reading);
-    serve(listener, Arc::new(store), role.shutdown.clone()).await?;
+    serve(listener, tables, role.shutdown.clone()).await?;
     tracing::info!("replay ended: everything acknowledged is stored");
     Ok(())
 }

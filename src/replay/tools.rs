@@ -71,6 +71,9 @@ pub(crate) enum Tool {
     Snapshot {
         /// The copy's name: letters, digits, `-`, `_` and `.`.
         name: String,
+        /// The table whose store is copied. [default: default]
+        #[arg(long, value_name = "NAME")]
+        table: Option<String>,
         #[command(flatten)]
         config: ConfigArgs,
         /// One JSON object on stdout.
@@ -109,7 +112,9 @@ impl Tool {
             Self::Repair { dir, json } => print_rewritten(&getup_replay::repair(&dir)?, json),
             Self::Compact { dir, keep, json } => print_rewritten(&getup_replay::compact(&dir, keep)?, json),
             Self::Export { dir, format, output, id, json } => export(&dir, format, output, id, json),
-            Self::Snapshot { name, config, json } => snapshot(&name, &config, json),
+            Self::Snapshot { name, table, config, json } => {
+                snapshot(&name, &table.unwrap_or_default(), &config, json)
+            }
         }
     }
 }
@@ -243,9 +248,9 @@ fn dataset(output: Option<PathBuf>, id: Option<String>, run: &str) -> Result<(Pa
 }
 
 #[tokio::main(flavor = "current_thread")]
-async fn snapshot(name: &str, config: &ConfigArgs, json: bool) -> Result<()> {
+async fn snapshot(name: &str, table: &str, config: &ConfigArgs, json: bool) -> Result<()> {
     let address = config.load()?.network.replay;
-    let taken = getup_replay::take_snapshot(&address, name).await;
+    let taken = getup_replay::take_snapshot(&address, table, name).await;
     let taken = taken.map_err(|status| anyhow::anyhow!("replay at {address}: {}", status.message()))?;
     let transitions = taken.counters.unwrap_or_default().transitions;
     if json {

@@ -71,6 +71,8 @@ impl GrpcReplay {
             spec: Some(self.spec.to_wire()),
             writer: self.identity.writer,
             name: self.identity.name.clone(),
+            // Where a run's transitions go.
+            table: String::new(),
         };
         let _ = requests.send(request(Message::Hello(hello)));
         let replies = self.client.append(UnboundedReceiverStream::new(receiver)).await?.into_inner();

@@ -1,8 +1,8 @@
-//! The gRPC service around a store: [`serve`].
+//! The gRPC service around stores, its tables: [`serve`].
 //!
 //! - [`append`]: a writer's stream
 //! - [`sample`]: a sampler's stream
-//! - [`committer`]: the one thread that appends, for all streams together
+//! - [`committer`]: the one thread that appends to a table, for all streams together
 
 mod append;
 mod committer;
@@ -11,16 +11,19 @@ mod sample;
 use crate::error::StoreError;
 use crate::metrics::ReplayMetrics;
 use crate::store::Store;
+use crate::tables::{DEFAULT_TABLE, Tables};
 use append::AppendStream;
 use committer::Job;
 use getup_proto::v1::replay_server::{Replay, ReplayServer};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, SpecError, v1};
 use getup_telemetry::Shutdown;
 use getup_telemetry::health::{ServingStatus, health};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
+use tokio::task::JoinSet;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status, Streaming};
@@ -52,19 +55,26 @@ pub enum ServeError {
     Panicked(#[from] tokio::task::JoinError),
 }
 
-/// Serves the store and the gRPC health service until `shutdown`: then takes no more segments, acknowledges those
-/// that came, ends all streams with UNAVAILABLE, and returns.
+/// Serves the tables and the gRPC health service until `shutdown`: then takes no more segments, acknowledges those
+/// that came, ends all streams with UNAVAILABLE, and returns. A store alone is the table `default`.
 ///
 /// # Errors
-/// [`ServeError`], when the store or the network fails.
-pub async fn serve(listener: TcpListener, store: Arc<Store>, shutdown: Shutdown) -> Result<(), ServeError> {
-    let (jobs, queue) = mpsc::channel(committer::queue_length(store.spec()));
-    let committing = {
-        let (store, shutdown) = (store.clone(), shutdown.clone());
-        tokio::task::spawn_blocking(move || committer::run(&store, queue, &shutdown))
+/// [`ServeError`], when a store or the network fails.
+pub async fn serve(
+    listener: TcpListener,
+    tables: impl Into<Tables>,
+    shutdown: Shutdown,
+) -> Result<(), ServeError> {
+    let mut committing = JoinSet::new();
+    let mut begin = |(name, store): (String, Arc<Store>)| {
+        let (jobs, queue) = mpsc::channel(committer::queue_length(store.spec()));
+        let (committed, shutdown) = (store.clone(), shutdown.clone());
+        committing.spawn_blocking(move || committer::run(&committed, queue, &shutdown));
+        (name, Table { store, jobs })
     };
+    let tables: BTreeMap<String, Table> = tables.into().into_stores().into_iter().map(&mut begin).collect();
     let (reporter, health) = health();
-    let service = ReplayServer::new(Service { store, jobs, shutdown: shutdown.clone() })
+    let service = ReplayServer::new(Service { tables, shutdown: shutdown.clone() })
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES);
     let drain = {
@@ -86,27 +96,57 @@ pub async fn serve(listener: TcpListener, store: Arc<Store>, shutdown: Shutdown)
         shutdown.wait().await;
         tokio::time::sleep(GRACE).await;
     };
-    tokio::pin!(committing);
     tokio::select! {
         served = serving => served?,
-        committed = &mut committing => return Ok(committed??),
+        // While its queue has a sender, a committer ends only when its store does.
+        Some(committed) = committing.join_next() => return Ok(committed??),
         () = out_of_patience => tracing::warn!("replay ends with streams open: their clients did not let go"),
     }
-    // The committer ends once it has worked off its queue and all streams, which hold the other end, are gone.
-    match tokio::time::timeout(GRACE, committing).await {
-        Ok(committed) => Ok(committed??),
-        Err(_) => {
-            tracing::warn!("replay ends before its committer: a stream or the disk holds it up");
-            Ok(())
+    // A committer ends once it has worked off its queue and all streams, which hold the other end, are gone.
+    let ended = async {
+        while let Some(committed) = committing.join_next().await {
+            committed??;
         }
-    }
+        Ok(())
+    };
+    tokio::time::timeout(GRACE, ended).await.unwrap_or_else(|_| {
+        tracing::warn!("replay ends before its committer: a stream or the disk holds it up");
+        Ok(())
+    })
 }
 
 /// What all streams share.
 struct Service {
+    tables: BTreeMap<String, Table>,
+    shutdown: Shutdown,
+}
+
+/// A store, and the way to the thread that appends to it.
+struct Table {
     store: Arc<Store>,
     jobs: mpsc::Sender<Job>,
-    shutdown: Shutdown,
+}
+
+impl Service {
+    /// The table of this name; of none, the default.
+    fn table(&self, name: &str) -> Result<&Table, Status> {
+        let asked = if name.is_empty() { DEFAULT_TABLE } else { name };
+        self.tables.get(asked).ok_or_else(|| {
+            let there_are = self.tables.keys().map(String::as_str).collect::<Vec<_>>().join(", ");
+            Status::not_found(format!("there is no table `{asked}` here, but {there_are}"))
+        })
+    }
+
+    fn store(&self, name: &str) -> Result<Arc<Store>, Status> {
+        Ok(self.table(name)?.store.clone())
+    }
+
+    /// Counts a stream that has not come as far as to name its table.
+    fn refuse(&self, reason: &str) {
+        if let Some(table) = self.tables.get(DEFAULT_TABLE) {
+            table.store.metrics().reject(reason);
+        }
+    }
 }
 
 #[tonic::async_trait]
@@ -123,12 +163,12 @@ impl Replay for Service {
             Some(v1::append_request::Message::Hello(hello)) => Ok(hello),
             _ => Err(no_hello()),
         });
-        let metrics = self.store.metrics();
-        let hello = first.inspect_err(|_| metrics.reject("hello"))?;
-        check_spec(self.store.spec(), hello.spec, metrics)?;
+        let hello = first.inspect_err(|_| self.refuse("hello"))?;
+        let Table { store, jobs } = self.table(&hello.table).inspect_err(|_| self.refuse("table"))?;
+        check_spec(store.spec(), hello.spec, store.metrics())?;
         let name = named(hello.name, || format!("writer {}", hello.writer));
         let (replies, outbound) = mpsc::channel(REPLIES);
-        let stream = AppendStream::new(self.store.clone(), self.jobs.clone(), hello.writer, name).await?;
+        let stream = AppendStream::new(store.clone(), jobs.clone(), hello.writer, name).await?;
         tokio::spawn(stream.run(inbound, replies, self.shutdown.clone()));
         Ok(Response::new(ReceiverStream::new(outbound)))
     }
@@ -142,34 +182,40 @@ impl Replay for Service {
             Some(v1::sample_request::Message::Hello(hello)) => Ok(hello),
             _ => Err(no_hello()),
         });
-        let metrics = self.store.metrics();
-        let mut hello = first.inspect_err(|_| metrics.reject("hello"))?;
-        check_spec(self.store.spec(), hello.spec.take(), metrics)?;
-        let source = sample::source(&self.store, hello, self.shutdown.clone())
+        let mut hello = first.inspect_err(|_| self.refuse("hello"))?;
+        let store = self.store(&hello.table).inspect_err(|_| self.refuse("table"))?;
+        let metrics = store.metrics();
+        check_spec(store.spec(), hello.spec.take(), metrics)?;
+        let source = sample::source(&store, hello, self.shutdown.clone())
             .inspect_err(|_| metrics.reject("options"))?;
         let (replies, outbound) = mpsc::channel(REPLIES);
         sample::start(source, inbound, replies, self.shutdown.clone());
         Ok(Response::new(ReceiverStream::new(outbound)))
     }
 
-    async fn describe(&self, _: Request<v1::DescribeRequest>) -> Result<Response<v1::DescribeReply>, Status> {
-        let store = self.store.clone();
+    async fn describe(
+        &self,
+        request: Request<v1::DescribeRequest>,
+    ) -> Result<Response<v1::DescribeReply>, Status> {
+        let store = self.store(&request.into_inner().table)?;
         let described = tokio::task::spawn_blocking(move || store.describe()).await;
-        described.map(Response::new).map_err(|error| Status::internal(error.to_string()))
+        let described = described.map_err(|error| Status::internal(error.to_string()))?;
+        let tables = self.tables.keys().cloned().collect();
+        Ok(Response::new(v1::DescribeReply { tables, ..described }))
     }
 
     async fn update_priorities(
         &self,
         request: Request<v1::UpdatePrioritiesRequest>,
     ) -> Result<Response<v1::UpdatePrioritiesReply>, Status> {
-        let v1::UpdatePrioritiesRequest { keys, priorities } = request.into_inner();
+        let v1::UpdatePrioritiesRequest { keys, priorities, table } = request.into_inner();
         if keys.len() != priorities.len() {
             let (keys, priorities) = (keys.len(), priorities.len());
             return Err(Status::invalid_argument(format!(
                 "{keys} keys came with {priorities} priorities: pair them"
             )));
         }
-        let store = self.store.clone();
+        let store = self.store(&table)?;
         let updating = tokio::task::spawn_blocking(move || {
             store.update_priorities(&keys.into_iter().zip(priorities).collect::<Vec<_>>())
         });
@@ -183,14 +229,14 @@ impl Replay for Service {
         &self,
         request: Request<v1::SnapshotRequest>,
     ) -> Result<Response<v1::SnapshotReply>, Status> {
-        let name = request.into_inner().name;
+        let v1::SnapshotRequest { name, table } = request.into_inner();
         let allowed = |character: char| character.is_ascii_alphanumeric() || "-_.".contains(character);
         if name.is_empty() || name.len() > 100 || name.starts_with('.') || !name.chars().all(allowed) {
             return Err(Status::invalid_argument(format!(
                 "{name:?} is no snapshot's name: take up to 100 letters, digits, `-`, `_` and `.`, and no `.` first"
             )));
         }
-        let store = self.store.clone();
+        let store = self.store(&table)?;
         let taken = tokio::task::spawn_blocking(move || {
             let started = Instant::now();
             let path = store.dir().join(SNAPSHOTS).join(&name);

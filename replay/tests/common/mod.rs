@@ -109,7 +109,12 @@ impl Replay {
 
 pub fn hello(spec: &RunSpec, writer: u64) -> v1::append_request::Message {
     let name = format!("actor-{writer}");
-    v1::append_request::Message::Hello(v1::AppendHello { spec: Some(spec.to_wire()), writer, name })
+    v1::append_request::Message::Hello(v1::AppendHello {
+        spec: Some(spec.to_wire()),
+        writer,
+        name,
+        table: String::new(),
+    })
 }
 
 pub fn message(segment: &Segment) -> v1::append_request::Message {
