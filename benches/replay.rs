@@ -472,7 +472,8 @@ fn serve_bare(batch: usize) -> Result<()> {
         ("discount", 1),
     ];
     let columns: Vec<_> = columns.map(|(name, width)| column(name, width)).into();
-    let minibatch = v1::Minibatch { columns, counters: Some(v1::ReplayCounters::default()) };
+    let counters = Some(v1::ReplayCounters::default());
+    let minibatch = v1::Minibatch { columns, counters, ..v1::Minibatch::default() };
     // As many as a message of the service holds.
     let count = ((4 << 20) / (batch * 160 * 4)).clamp(1, PREFETCH / 4);
     let reply = v1::SampleReply { minibatches: vec![minibatch; count] };
