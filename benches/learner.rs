@@ -115,6 +115,7 @@ impl<'a> Side<'a> {
             reward: column(1),
             discount: vec![0.97; case.batch],
             beta: vec![1.0; case.batch],
+            weight: Vec::new(),
         };
         let sac = Sac::new(&shape, &config, 0, getup_learner::device::cpu(case.threads), case.threads);
         let [ours, limit, peer] = [const { Vec::new() }; 3];

@@ -10,7 +10,7 @@ use getup_actor::config::ActorConfig;
 use getup_actor::explore::BetaDraw;
 use getup_learner::config::{CurriculumConfig, EvaluationConfig, LearnerConfig, SacConfig};
 use getup_proto::{ColumnSpec, Rows, RunSpec, columns};
-use getup_replay::{ReplayConfig, SyncMode};
+use getup_replay::{ItemSelector, ReplayConfig, SyncMode};
 use getup_sim::{GetUp, Task, TaskConfig};
 use serde::{Deserialize, Serialize};
 
@@ -49,6 +49,8 @@ pub(crate) struct Config {
 pub(crate) struct ReplayTable {
     /// Transitions that can be sampled; the oldest go first.
     pub(crate) capacity: usize,
+    /// Transitions are drawn in proportion to their last error to this power; 0 draws them all alike.
+    pub(crate) priority_exponent: f64,
     /// What an acknowledged segment survives: `process` (a kill) or `data` (a power loss too).
     pub(crate) sync: SyncMode,
 }
@@ -56,7 +58,7 @@ pub(crate) struct ReplayTable {
 impl Default for ReplayTable {
     fn default() -> Self {
         let ReplayConfig { capacity, sync, .. } = ReplayConfig::default();
-        Self { capacity, sync }
+        Self { capacity, priority_exponent: 0.0, sync }
     }
 }
 
@@ -206,7 +208,11 @@ impl Config {
             samples_per_insert: Some(samples_per_insert),
             // A tenth of the first minibatches, and room for two of the longest segments and for a minibatch.
             error_buffer: Some((0.1 * middle).max(2.0 * segment).max(2.0 * self.sac.batch as f64)),
-            ..ReplayConfig::default()
+            sampler: match self.replay.priority_exponent {
+                0.0 => ItemSelector::Uniform,
+                exponent => ItemSelector::Prioritized { exponent },
+            },
+            max_times_sampled: None,
         }
     }
 

@@ -332,6 +332,7 @@ mod tests {
             reward: column(1, -1.0, 1.0),
             discount: column(1, 0.0, 0.97),
             beta: column(1, 0.5, 1.0),
+            weight: Vec::new(),
         }
     }
 

@@ -68,6 +68,9 @@ pub struct SacConfig {
     pub temperature_floor: f64,
     /// The entropy that the temperature is steered to, in nats; `auto` is −(numbers in an action).
     pub target_entropy: TargetEntropy,
+    /// Where the replay draws by priority: how far the critics' losses make up for it, from 0 to 1 (β of Schaul et al.
+    /// 2016, §3.4).
+    pub importance_exponent: f64,
     /// Updates for every env step; the rate limiter keeps it.
     pub updates_per_step: f64,
     /// Env steps of uniform actions before the first update; where the run begins with trained networks, of theirs.
@@ -183,6 +186,7 @@ impl Default for SacConfig {
             initial_temperature: 0.1,
             temperature_floor: 0.0,
             target_entropy: TargetEntropy::Auto(Auto::Auto),
+            importance_exponent: 0.4,
             updates_per_step: 1.0,
             uniform_steps: 10_000,
             critics_first: 0,
@@ -231,6 +235,8 @@ impl SacConfig {
         )?;
         let entropy = self.target_entropy.nats(1);
         check(entropy.is_finite(), "sac.target_entropy", &entropy, "a number of nats, or \"auto\"")?;
+        let exponent = self.importance_exponent;
+        check((0.0..=1.0).contains(&exponent), "sac.importance_exponent", &exponent, "from 0 to 1")?;
         let rate = self.updates_per_step;
         check(rate > 0.0 && rate <= 100.0, "sac.updates_per_step", &rate, "over 0, at most 100")
     }

@@ -41,6 +41,8 @@ pub struct Batch {
     pub discount: Vec<f32>,
     /// `[B]`: the episode's β̂.
     pub beta: Vec<f32>,
+    /// `[B]`: what each transition's error counts for in the critics' losses; empty where all count alike.
+    pub weight: Vec<f32>,
 }
 
 impl Batch {
@@ -48,12 +50,17 @@ impl Batch {
     pub fn rows(&self) -> usize {
         self.reward.len()
     }
+
+    /// Of one transition's error.
+    pub(crate) fn weight(&self, row: usize) -> f32 {
+        self.weight.get(row).copied().unwrap_or(1.0)
+    }
 }
 
 /// What one update found, for metrics.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Losses {
-    /// Mean squared error of the critics, summed over them.
+    /// Mean squared error of the critics, by the transitions' weights, summed over them.
     pub critic: f64,
     /// Mean of α·log π − Q.
     pub actor: f64,
@@ -96,6 +103,8 @@ pub struct Sac {
     pub(crate) statistics: RunningStatistics,
     pub(crate) rng: ChaCha8Rng,
     pub(crate) updates: u64,
+    /// See [`Sac::td_errors`].
+    td_errors: Vec<f32>,
     /// The update for processors, laid out at the first one; see [`Sac::changed`].
     cpu: OnCpu,
 }
@@ -134,6 +143,7 @@ impl Sac {
             critics,
             rng,
             updates: 0,
+            td_errors: Vec::new(),
             cpu: OnCpu::Unknown,
         }
     }
@@ -165,6 +175,11 @@ impl Sac {
         if self.config.normalize_observations {
             self.statistics.merge(&batch.observation);
         }
+    }
+
+    /// `[B]`: |Q − y| of the last update's transitions, mean over the critics: their priorities.
+    pub fn td_errors(&self) -> &[f32] {
+        &self.td_errors
     }
 
     /// One update of critics, actor, temperature and targets.
@@ -217,9 +232,14 @@ impl Sac {
             reward + discount * (next_q - next.log_prob * temperature)
         });
 
-        // Σ over critics of mean (Q − y)²
+        // Σ over critics of mean w (Q − y)²
         let q = self.critics.forward(&observation, &action);
-        let critic_loss = (&q - target).square().mean_dim(&[1i64][..], false, Kind::Float).sum(Kind::Float);
+        let error = &q - target;
+        let weights: Vec<f32> = (0..batch.rows()).map(|row| batch.weight(row)).collect();
+        let squares = error.square() * column(&weights);
+        let critic_loss = squares.mean_dim(&[1i64][..], false, Kind::Float).sum(Kind::Float);
+        let errors = error.abs().mean_dim(&[0i64][..], false, Kind::Float).to_device(Device::Cpu);
+        self.td_errors = Vec::try_from(&errors).expect("errors are numbers");
         let critic = self.finite("critic", critic_loss.double_value(&[]))?;
         let gradient = self.critics.parameters.gradient(&critic_loss);
         self.critics_adam.step(&mut self.critics.parameters, &gradient);
@@ -259,6 +279,7 @@ impl Sac {
 
         let critic = cpu.critics_backward(&inputs, Values { actor, critics, targets });
         let critic_loss = self.finite("critic", critic.loss)?;
+        cpu.td_errors(&mut self.td_errors);
         let step = self.critics_adam.begin_step();
         let (first, second) = self.critics_adam.moments();
         cpu.critics_step(Flat { values: critics, first, second }, targets, step, self.config.tau as f32);

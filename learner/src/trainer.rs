@@ -211,7 +211,10 @@ impl Trainer {
             match source.poll(STARVED) {
                 Ok(Some(minibatch)) => {
                     self.metrics.wait_seconds.observe(asked.elapsed().as_secs_f64());
-                    self.tick(minibatch)?;
+                    let priorities = self.tick(minibatch)?;
+                    if !priorities.is_empty() {
+                        source.update_priorities(priorities)?;
+                    }
                 }
                 Ok(None) => self.take_reports()?,
                 Err(SampleError::Shutdown) => break,
@@ -225,10 +228,19 @@ impl Trainer {
     }
 
     /// One update and everything that follows from it.
-    pub fn tick(&mut self, mut minibatch: Minibatch) -> Result<(), TrainError> {
+    ///
+    /// Returns the priorities of its transitions by their keys, where the replay draws by priority.
+    pub fn tick(&mut self, minibatch: Minibatch) -> Result<Vec<(u64, f32)>, TrainError> {
+        let keys: Vec<u64> = minibatch.items.iter().map(|item| item.key).collect();
+        self.learn(minibatch)?;
+        Ok(keys.into_iter().zip(self.sac.td_errors().iter().copied()).collect())
+    }
+
+    fn learn(&mut self, mut minibatch: Minibatch) -> Result<(), TrainError> {
         let started = Instant::now();
         self.progress.count(&minibatch.counters);
-        let batch = Batch::from_minibatch(&mut minibatch)?;
+        let mut batch = Batch::from_minibatch(&mut minibatch)?;
+        batch.weight = minibatch.importance_weights(self.config.sac.importance_exponent as f32);
         if self.progress.env_steps < self.config.sac.normalize_until {
             self.sac.merge_statistics(&batch);
         }
@@ -370,6 +382,7 @@ impl Batch {
             next_observation: column("next_observation")?,
             discount: column("discount")?,
             beta: column("beta")?,
+            weight: Vec::new(),
         })
     }
 }

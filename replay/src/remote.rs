@@ -1,7 +1,7 @@
 //! Sampling a replay service: [`RemoteSource`], and [`describe`].
 
 use crate::gate::Waiting;
-use crate::minibatch::{Minibatch, SampleOptions};
+use crate::minibatch::{Minibatch, OptionsError, SampleOptions};
 use crate::source::{MinibatchSource, SampleError};
 use getup_proto::v1::replay_client::ReplayClient;
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, v1};
@@ -23,6 +23,10 @@ const REASON_TICK: Duration = Duration::from_secs(1);
 const CALL_PATIENCE: Duration = Duration::from_secs(5);
 /// A service that does not answer pings for this long is gone.
 const PING_EVERY: Duration = Duration::from_secs(10);
+/// Priorities of a message, at least: until there are so many, the service draws by older ones.
+const PRIORITIES_AT_ONCE: usize = 1024;
+/// Messages of priorities that wait for a connection; beyond, they are dropped.
+const PRIORITY_MESSAGES: usize = 16;
 /// Messages of credits that are enough for all that is fetched ahead.
 const CREDITS_AHEAD: u32 = 4;
 /// Bytes of a stream that may be on their way to a client that is not reading.
@@ -35,6 +39,10 @@ pub struct RemoteSource {
     queue: Receiver<Result<Minibatch, SampleError>>,
     /// Tells the task that a minibatch was taken from the queue.
     taken: mpsc::UnboundedSender<()>,
+    /// Priorities for the task to send.
+    priorities: mpsc::Sender<Vec<(u64, f32)>>,
+    /// Some that are not worth a message yet.
+    gathered: Vec<(u64, f32)>,
     /// Why there is none.
     reason: Reason,
     waits: Waits,
@@ -70,18 +78,20 @@ impl RemoteSource {
         // One place more, for the error that ends it.
         let (sender, queue) = sync_channel(prefetch + 1);
         let (taken, consumed) = mpsc::unbounded_channel();
+        let (priorities, updates) = mpsc::channel(PRIORITY_MESSAGES);
         let reason = Reason::default();
         let fetching = Fetching {
             options,
             prefetch,
             queue: sender,
             consumed,
+            updates,
             queued: 0,
             reason: reason.clone(),
             streams: 0,
         };
         runtime.spawn(fetching.run());
-        Self { queue, taken, reason, waits, wait: None, shutdown }
+        Self { queue, taken, priorities, gathered: Vec::new(), reason, waits, wait: None, shutdown }
     }
 }
 
@@ -118,6 +128,20 @@ impl MinibatchSource for RemoteSource {
                 Some(_) => {}
             }
         }
+    }
+
+    fn update_priorities(&mut self, priorities: Vec<(u64, f32)>) -> Result<(), SampleError> {
+        if let Some(&(key, priority)) =
+            priorities.iter().find(|(_, priority)| !(priority.is_finite() && *priority >= 0.0))
+        {
+            return Err(OptionsError::Priority { key, priority }.into());
+        }
+        self.gathered.extend(priorities);
+        if self.gathered.len() >= PRIORITIES_AT_ONCE {
+            // Without a connection they wait, and then they are too old to matter.
+            let _ = self.priorities.try_send(std::mem::take(&mut self.gathered));
+        }
+        Ok(())
     }
 }
 
@@ -190,6 +214,7 @@ struct Fetching {
     prefetch: usize,
     queue: SyncSender<Result<Minibatch, SampleError>>,
     consumed: mpsc::UnboundedReceiver<()>,
+    updates: mpsc::Receiver<Vec<(u64, f32)>>,
     /// Minibatches in the queue.
     queued: usize,
     reason: Reason,
@@ -280,6 +305,18 @@ impl Fetching {
                             return End::Gone("it ended the stream".to_owned());
                         }
                     }
+                },
+                Some(priorities) = self.updates.recv() => {
+                    let (keys, priorities) = priorities.into_iter().unzip();
+                    let table = self.options.table.clone();
+                    let request = v1::UpdatePrioritiesRequest { keys, priorities, table };
+                    let mut client = client.clone();
+                    // Beside the stream, which must not wait for it. One that fails is found anew at the next draw.
+                    tokio::spawn(async move {
+                        if let Err(status) = client.update_priorities(request).await {
+                            tracing::debug!("priorities were lost: {}", status.message());
+                        }
+                    });
                 },
                 _ = asked_why.tick(), if self.queued == 0 => {
                     if let Ok(described) = ask(ReplayClient::new(channel.clone()), &self.options.table).await {

@@ -32,6 +32,13 @@ pub trait MinibatchSource: Send {
             }
         }
     }
+
+    /// Gives transitions of earlier minibatches priorities, by their keys; those that are gone by now are left out.
+    /// They count sooner or later, and may be lost with a connection: the next draw of a transition finds it anew.
+    ///
+    /// # Errors
+    /// [`SampleError::Options`] if one is negative or not finite.
+    fn update_priorities(&mut self, priorities: Vec<(u64, f32)>) -> Result<(), SampleError>;
 }
 
 /// Why there is no next minibatch.
@@ -128,6 +135,11 @@ impl LocalSource {
 impl MinibatchSource for LocalSource {
     fn poll(&mut self, patience: Duration) -> Result<Option<Minibatch>, SampleError> {
         self.poll_unless(patience, || false)
+    }
+
+    fn update_priorities(&mut self, priorities: Vec<(u64, f32)>) -> Result<(), SampleError> {
+        self.store.update_priorities(&priorities)?;
+        Ok(())
     }
 }
 

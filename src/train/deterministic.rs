@@ -110,7 +110,10 @@ impl Turns {
     fn update(&mut self, role: &Role) -> Result<()> {
         while self.trainer.ending().is_none() && !role.shutdown.is_triggered() {
             match self.store.try_sample(&mut self.sampler, &self.options)? {
-                Some(minibatch) => self.trainer.tick(minibatch)?,
+                Some(minibatch) => {
+                    let priorities = self.trainer.tick(minibatch)?;
+                    self.store.update_priorities(&priorities)?;
+                }
                 None => break,
             }
         }

@@ -24,6 +24,7 @@ fn batch(rows: usize, rng: &mut ChaCha8Rng) -> Batch {
         next_observation: random(rows * SHAPE.observation, -2.0, 2.0, rng),
         discount: random(rows, 0.0, 0.97, rng),
         beta: random(rows, 0.4, 1.6, rng),
+        weight: Vec::new(),
     }
 }
 

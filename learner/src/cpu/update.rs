@@ -94,10 +94,18 @@ impl CpuUpdate {
         })
     }
 
-    /// Critics' losses and gradients: y = r + γ (min Q'(s', a') − α log π(a'|s')), mean (Q(s, a) − y)².
+    /// Critics' losses and gradients: y = r + γ (min Q'(s', a') − α log π(a'|s')), mean w (Q(s, a) − y)².
     pub(crate) fn critics_backward(&mut self, inputs: &Inputs<'_>, values: Values<'_>) -> Phase {
         self.lay_out(inputs.batch.rows());
         self.backward(values, |worker, networks| worker.critics_backward(networks, inputs))
+    }
+
+    /// |Q − y| of the last [`CpuUpdate::critics_backward`], mean over the critics, row after row.
+    pub(crate) fn td_errors(&self, errors: &mut Vec<f32>) {
+        errors.clear();
+        for worker in &self.workers {
+            errors.extend_from_slice(&worker.td_errors);
+        }
     }
 
     /// The actor's loss and gradients: mean (α log π(a|s) − min Q(s, a)), a ~ π(s). The minibatch is that of the last
@@ -232,6 +240,8 @@ struct Worker {
     critics: Vec<Trace>,
     actor_gradient: Aligned<f32>,
     critics_gradient: Aligned<f32>,
+    /// |Q − y| of each transition, mean over the critics.
+    td_errors: Vec<f32>,
     phase: Phase,
 }
 
@@ -255,6 +265,7 @@ impl Worker {
             critics: (0..critics).map(|_| Trace::new(critic, padded)).collect(),
             actor_gradient: zeros(actor.length),
             critics_gradient: zeros(critics * critic.length),
+            td_errors: vec![0.0; rows.len()],
             phase: Phase::default(),
             rows,
         }
@@ -294,17 +305,21 @@ impl Worker {
         }
 
         self.phase = Phase::default();
+        self.td_errors.fill(0.0);
         let scale = 1.0 / batch.rows() as f64;
+        let share = 1.0 / networks.critic_weights.len() as f32;
         let critics = networks.values.critics.chunks_exact(critic.length).zip(networks.critic_weights);
         let gradients = self.critics_gradient.chunks_exact_mut(critic.length);
         for (((values, weights), gradient), trace) in critics.zip(gradients).zip(&mut self.critics) {
             critic.forward(values, weights, &self.now, trace);
             trace.output_gradients[0].fill(0.0);
-            for row in 0..rows.len() {
+            for (row, index) in rows.clone().enumerate() {
                 let q = trace.outputs[0][row];
                 let error = q - self.value[row];
-                trace.output_gradients[0][row] = 2.0 * error * scale as f32;
-                self.phase.loss += f64::from(error) * f64::from(error) * scale;
+                let weighted = batch.weight(index) * error;
+                trace.output_gradients[0][row] = 2.0 * weighted * scale as f32;
+                self.td_errors[row] += share * error.abs();
+                self.phase.loss += f64::from(weighted) * f64::from(error) * scale;
                 self.phase.value += f64::from(q) * scale / networks.critic_weights.len() as f64;
             }
             critic.backward(values, weights, trace, Some(gradient), None);

@@ -75,6 +75,7 @@ fn matches_pytorch(take: Update) {
             next_observation: column("next_observation"),
             discount: column("discount"),
             beta: column("beta"),
+            weight: Vec::new(),
         };
         let losses = take(&mut sac, &batch, &update.next_noise, &update.noise).unwrap();
         assert!((losses.critic - update.critic_loss).abs() < 1e-5);
@@ -101,6 +102,7 @@ fn toy_batch(size: usize, gamma: f32, rng: &mut ChaCha8Rng) -> Batch {
         reward,
         discount: vec![gamma; size],
         beta: vec![1.0; size],
+        weight: Vec::new(),
     }
 }
 

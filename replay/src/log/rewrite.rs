@@ -79,8 +79,10 @@ fn rewrite(dir: &Path, found: &Found, excess: u64) -> Result<(u64, u64), StoreEr
     if unfinished.exists() {
         fs::remove_dir_all(&unfinished).map_err(StoreError::io("remove", &unfinished))?;
     }
-    // Nothing may be evicted from it.
-    let config = ReplayConfig { capacity: crate::MAX_CAPACITY, ..ReplayConfig::default() };
+    // Just enough that nothing is evicted from it, and that its files are of the usual share.
+    let Survey { spec, transitions, .. } = &found.survey;
+    let capacity = (transitions - excess).max(2 * spec.max_segment_steps as u64);
+    let config = ReplayConfig { capacity: capacity as usize, min_size: 1, ..ReplayConfig::default() };
     let mut writing = Writing {
         dir: unfinished,
         found,
