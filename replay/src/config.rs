@@ -84,6 +84,17 @@ pub enum ConfigError {
     /// Nothing could ever be drawn.
     #[error("replay.max_times_sampled is 0: it must be 1 or more; leave it out for no limit")]
     MaxTimesSampled,
+    /// Transitions would run out.
+    #[error(
+        "replay.samples_per_insert is {samples_per_insert}, and replay.max_times_sampled {max_times_sampled}: \
+         transitions would run out and all would wait; raise max_times_sampled"
+    )]
+    RunsOut {
+        /// As configured.
+        samples_per_insert: f64,
+        /// As configured.
+        max_times_sampled: u32,
+    },
     /// `error_buffer` is so narrow that writers and samplers would wait for each other.
     #[error(
         "replay.error_buffer is {error_buffer}: it must be at least {min}, samples_per_insert times the longest \
@@ -137,6 +148,11 @@ impl ReplayConfig {
         if !(samples_per_insert.is_finite() && samples_per_insert > 0.0) {
             return Err(ConfigError::SamplesPerInsert(samples_per_insert));
         }
+        if let Some(max_times_sampled) = self.max_times_sampled
+            && samples_per_insert > f64::from(max_times_sampled)
+        {
+            return Err(ConfigError::RunsOut { samples_per_insert, max_times_sampled });
+        }
         let min = samples_per_insert * max_segment_steps as f64;
         match self.error_buffer {
             Some(error_buffer) if !(error_buffer.is_finite() && error_buffer >= min) => {
@@ -166,6 +182,11 @@ mod tests {
         assert!(refused(&|c| c.max_times_sampled = Some(0)).contains("max_times_sampled is 0"));
         let steep = refused(&|c| c.sampler = ItemSelector::Prioritized { exponent: f64::NAN });
         assert!(steep.contains("exponent is NaN"), "{steep}");
+        let runs_out = refused(&|c| {
+            c.samples_per_insert = Some(2.0);
+            c.max_times_sampled = Some(1);
+        });
+        assert!(runs_out.contains("transitions would run out"), "{runs_out}");
         let narrow = refused(&|c| {
             c.samples_per_insert = Some(256.0);
             c.error_buffer = Some(1000.0);

@@ -130,6 +130,10 @@ impl Gate {
             if left.is_zero() || cancelled() {
                 return false;
             }
+            if matches!(blocked, Blocked::Consumed { .. }) {
+                inner.limiter.want(batch);
+                self.wake_writers();
+            }
             self.explain(wait, "sampler", || inner.reason(&blocked, &inner.writers));
             let tick = left.min(CANCEL_TICK);
             inner = self.moved.wait_timeout(inner, tick).unwrap_or_else(PoisonError::into_inner).0;
@@ -239,6 +243,11 @@ impl Gate {
 
     fn wake(&self) {
         self.moved.notify_all();
+        self.wake_writers();
+    }
+
+    /// Those that are tasks; threads look for themselves, often enough.
+    fn wake_writers(&self) {
         self.moved_tasks.send_replace(());
     }
 

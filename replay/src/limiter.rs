@@ -40,6 +40,8 @@ pub(crate) struct Limiter {
     samples: u64,
     /// Draws that are left in the store; None where there is no limit.
     available: Option<u64>,
+    /// Transitions that a sampler waits for, where the draws that are left are fewer.
+    wanted: u64,
     /// Added to the cursor where an earlier process had other settings; see [`Limiter::restore`].
     offset: f64,
 }
@@ -49,7 +51,7 @@ pub(crate) struct Limiter {
 pub(crate) enum Blocked {
     /// Too few env steps for the first sample.
     MinSize { inserts: u64, min_size: u64 },
-    /// Every transition has been sampled as often as it may be.
+    /// There are too few transitions, or they have been sampled as often as they may be.
     Consumed { available: u64, transitions: u64 },
     /// A sample would take the cursor below its band.
     SamplesAhead { inserts: u64, samples: u64, samples_per_insert: f64 },
@@ -73,6 +75,7 @@ impl Limiter {
             reserved: 0,
             samples: 0,
             available: None,
+            wanted: 0,
             offset: 0.0,
         }
     }
@@ -93,6 +96,10 @@ impl Limiter {
     /// Whether an insert of this many env steps must wait.
     pub(crate) fn blocks_insert(&self, env_steps: u64) -> Option<Blocked> {
         let band = self.band?;
+        // Whoever waits for transitions waits for inserts: the band must not hold those up, or both would wait.
+        if self.available.is_some_and(|available| available < self.wanted) {
+            return None;
+        }
         let inserts = self.inserts + self.reserved + env_steps;
         let waits = env_steps > 0 && self.cursor_at(inserts, self.samples) > band.max;
         waits.then_some(Blocked::InsertsAhead {
@@ -136,6 +143,11 @@ impl Limiter {
         self.available = available;
     }
 
+    /// Notes that a sampler waits for so many transitions.
+    pub(crate) fn want(&mut self, transitions: u64) {
+        self.wanted = self.wanted.max(transitions);
+    }
+
     /// Counts env steps that have become durable.
     pub(crate) fn insert(&mut self, env_steps: u64) {
         self.inserts += env_steps;
@@ -144,6 +156,7 @@ impl Limiter {
     /// Counts transitions that are handed out.
     pub(crate) fn sample(&mut self, transitions: u64) {
         self.samples += transitions;
+        self.wanted = 0;
     }
 
     /// The most transitions that one sample may ever have; a larger one could wait forever.
@@ -183,12 +196,9 @@ impl fmt::Display for Blocked {
             Self::MinSize { inserts, min_size } => {
                 write!(f, "{} of {} transitions", thousands(inserts), thousands(min_size))
             }
-            Self::Consumed { available, transitions } => write!(
-                f,
-                "{} of {} transitions that were not sampled as often as they may be",
-                thousands(available),
-                thousands(transitions)
-            ),
+            Self::Consumed { available, transitions } => {
+                write!(f, "{} of {} transitions can be sampled", thousands(available), thousands(transitions))
+            }
             Self::SamplesAhead { inserts, samples, samples_per_insert } => write!(
                 f,
                 "{} samples of {} env steps are ahead of {samples_per_insert} samples per insert",

@@ -70,7 +70,9 @@ pub struct MinibatchColumn {
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]
 pub enum OptionsError {
     /// An empty or enormous batch.
-    #[error("a batch of {batch} cannot be sampled: it must lie in 1..={max}, so that a message holds it")]
+    #[error(
+        "a batch of {batch} cannot be sampled: it must lie in 1..={max}, so that a message and the store hold it"
+    )]
     Batch {
         /// As asked for.
         batch: usize,

@@ -313,8 +313,11 @@ impl Fetching {
                     let mut client = client.clone();
                     // Beside the stream, which must not wait for it. One that fails is found anew at the next draw.
                     tokio::spawn(async move {
-                        if let Err(status) = client.update_priorities(request).await {
-                            tracing::debug!("priorities were lost: {}", status.message());
+                        let sent = tokio::time::timeout(CALL_PATIENCE, client.update_priorities(request)).await;
+                        match sent {
+                            Ok(Ok(_)) => {}
+                            Ok(Err(status)) => tracing::debug!("priorities were lost: {}", status.message()),
+                            Err(_) => tracing::debug!("priorities were lost: replay does not answer"),
                         }
                     });
                 },

@@ -187,7 +187,7 @@ impl Ring {
 
     /// How many draws are left before transitions must come; None where there is no limit.
     pub(crate) fn available(&self) -> Option<u64> {
-        self.selector.as_ref().and_then(Selector::available)
+        if self.transitions == 0 { Some(0) } else { self.selector.as_ref().and_then(Selector::available) }
     }
 
     /// Draws a transition, each with the same probability.

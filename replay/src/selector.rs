@@ -27,6 +27,9 @@ pub enum ItemSelector {
     Lifo,
 }
 
+/// The greatest weight: a sum of as many as there can be is still a number.
+const GREATEST_WEIGHT: f64 = 1e200;
+
 /// What is known of the transitions in a ring, by the slots of their rows.
 #[derive(Clone, Debug)]
 pub(crate) struct Selector {
@@ -120,7 +123,8 @@ impl Selector {
             return false;
         }
         // What is 0 is gone: a transition of no priority keeps the least weight there is.
-        self.weights.set(slot, weight.max(f64::MIN_POSITIVE));
+        let weight = weight.clamp(f64::MIN_POSITIVE, GREATEST_WEIGHT);
+        self.weights.set(slot, weight);
         self.newest = self.newest.max(weight);
         true
     }
@@ -200,6 +204,10 @@ mod tests {
             .sum();
         // Four degrees of freedom: above 23.5 once in ten thousand seeds.
         assert!(chi_square < 23.5, "{chi_square}");
+        // However great one is, the sums stay numbers.
+        let mut steep = self::selector(ItemSelector::Prioritized { exponent: 10.0 }, None);
+        assert!(steep.set_priority(6, f32::MAX) && steep.set_priority(7, f32::MAX));
+        assert!([6, 7].contains(&steep.draw(&mut rng, 6).0));
         // A new one has the greatest priority there was.
         selector.insert(5);
         assert!((selector.weights.weight(5) - 3.0).abs() < 1e-9);

@@ -34,12 +34,15 @@ pub struct Store {
     /// Names the store.
     id: u64,
     capacity: usize,
+    max_times_sampled: Option<u32>,
     /// Whether draws change the ring.
     selects: bool,
     /// Locked by one append at a time, for as long as the disk takes.
     log: Mutex<Writing>,
     /// Locked briefly.
     memory: RwLock<Memory>,
+    /// Locked for as long as a snapshot takes.
+    snapshots: Mutex<()>,
     gate: Arc<Gate>,
     watermark: Arc<Watermark>,
     metrics: ReplayMetrics,
@@ -107,10 +110,12 @@ impl Store {
             spec: spec.clone(),
             id: log.store(),
             capacity: config.capacity,
+            max_times_sampled: config.max_times_sampled,
             selects: ring.selects(),
             watermark: log.watermark().clone(),
             log: Mutex::new(Writing { log, disk_measured: started }),
             memory: RwLock::new(Memory { ring, state }),
+            snapshots: Mutex::new(()),
             gate: Gate::new(limiter, waits.clone()),
             metrics,
             waits,
@@ -261,6 +266,7 @@ impl Store {
     /// # Errors
     /// [`StoreError::Io`]; the store itself goes on.
     pub fn snapshot(&self, to: &Path) -> Result<(Duration, ReplayCounters), StoreError> {
+        let _one_at_a_time = self.snapshots.lock().unwrap_or_else(PoisonError::into_inner);
         let writing = self.writing();
         let started = Instant::now();
         let snapshot = writing.log.begin_snapshot(to);
@@ -289,6 +295,11 @@ impl Store {
         let max = MAX_MESSAGE_BYTES / 2 / ((2 * widths + 2) * columns::VALUE_BYTES);
         if !(1..=max).contains(&batch) {
             return Err(OptionsError::Batch { batch, max });
+        }
+        let most =
+            self.max_times_sampled.map_or(usize::MAX, |times| self.capacity.saturating_mul(times as usize));
+        if batch > most {
+            return Err(OptionsError::Batch { batch, max: most });
         }
         let error_buffer = self.gate.limiter().largest_sample();
         if batch as f64 > error_buffer {

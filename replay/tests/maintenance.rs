@@ -130,8 +130,11 @@ fn compacting_keeps_the_newest_the_totals_and_the_marks() {
     let store = open(dir.path(), &spec(STEPS), &settings).unwrap();
     assert_eq!((store.counters().transitions, store.len()), (counters.transitions, 0));
     assert_eq!((store.introduce(77, "actor"), store.introduce(1, "actor")), (5, 200));
+    // Nothing to sample, whatever the totals say.
+    assert!(store.try_sample(&mut sampler, &options(32)).unwrap().is_none());
     store.append(vec![segment(&spec(STEPS), 1, 201, STEPS)]).unwrap();
     assert_eq!(store.len(), STEPS);
+    store.try_sample(&mut sampler, &options(32)).unwrap().unwrap();
 }
 
 #[test]
@@ -251,4 +254,66 @@ fn an_episode_is_whole_in_the_order_of_the_log() {
     store.append(parts.clone()).unwrap();
     drop(store);
     assert_eq!(read(dir.path()), parts);
+}
+
+#[test]
+fn a_snapshot_and_its_original_go_their_own_ways_also_where_the_newest_file_was_full() {
+    let dir = TempDir::new().unwrap();
+    // Two segments fill a file.
+    let settings = ReplayConfig { capacity: 256, ..config() };
+    let append = |dir: &Path, sequence| {
+        let store = open(dir, &spec(STEPS), &settings).unwrap();
+        store.append(vec![segment(&spec(STEPS), 1, sequence, STEPS)]).unwrap();
+    };
+    let copy = dir.path().join("copy");
+    let store = open(dir.path(), &spec(STEPS), &settings).unwrap();
+    store.append((1..=4).map(|i| segment(&spec(STEPS), 1, i, STEPS)).collect()).unwrap();
+    store.snapshot(&copy).unwrap();
+    let again = store.snapshot(&copy).unwrap_err().to_string();
+    assert!(again.contains("exists"), "{again}");
+    drop(store);
+    for sequence in 5..=9 {
+        append(&copy, sequence);
+    }
+    for sequence in 5..=6 {
+        append(dir.path(), sequence);
+    }
+    let sequences = |dir: &Path| read(dir).iter().map(|segment| segment.sequence).collect::<Vec<_>>();
+    assert_eq!((sequences(dir.path()), sequences(&copy)), ((1..=6).collect(), (1..=9).collect()));
+    for dir in [dir.path(), &copy] {
+        assert_eq!(Survey::read(dir, |_| {}).unwrap().damages, Vec::<String>::new());
+    }
+}
+
+#[test]
+fn a_rewriting_that_was_killed_halfway_is_finished_by_whoever_opens_the_store() {
+    // Of the three pairs of renames, so many were made; and of the next, the first where `half`.
+    for (moved, half) in [(0, false), (0, true), (1, false), (1, true), (2, false), (2, true), (3, false)] {
+        let (dir, copy) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+        let held = written(dir.path(), 256, 100);
+        let copied = copy.path().join("store");
+        let cp = |from: &Path, to: &Path| {
+            assert!(std::process::Command::new("cp").arg("-r").arg(from).arg(to).status().unwrap().success());
+        };
+        cp(dir.path(), &copied);
+        compact(&copied, Some(64)).unwrap();
+        let kept = read(&copied);
+        let (rewriting, replaced) = (dir.path().join("rewriting"), dir.path().join("replaced"));
+        cp(&copied, &rewriting);
+        fs::write(rewriting.join("complete"), "").unwrap();
+        fs::create_dir(&replaced).unwrap();
+        let names = ["segments", "index", "watermark"];
+        for (place, name) in names.iter().enumerate().take(moved + usize::from(half)) {
+            fs::rename(dir.path().join(name), replaced.join(name)).unwrap();
+            if place < moved {
+                fs::rename(rewriting.join(name), dir.path().join(name)).unwrap();
+            }
+        }
+        let store = open(dir.path(), &spec(STEPS), &ReplayConfig { capacity: 256, ..config() }).unwrap();
+        assert_eq!((store.counters().transitions, store.introduce(1, "actor")), (800, 100), "{moved} {half}");
+        drop(store);
+        assert_eq!(read(dir.path()), kept, "{moved} {half}");
+        assert!(kept.len() < held.len());
+        assert!(!rewriting.exists() && !replaced.exists());
+    }
 }

@@ -95,11 +95,6 @@ impl Tail {
         Ok(Self { path, file, end })
     }
 
-    /// Where the file lies.
-    pub(crate) fn path(&self) -> &Path {
-        &self.path
-    }
-
     /// Bytes in the file.
     pub(crate) fn bytes(&self) -> u64 {
         self.end

@@ -106,6 +106,7 @@ impl Log {
     ) -> Result<Self, StoreError> {
         fs::create_dir_all(dir).map_err(StoreError::io("create", dir))?;
         let lock = lock(dir)?;
+        rewrite::finish(dir)?;
         let (manifest, watermark) = match Manifest::read(dir, spec)? {
             Some(manifest) => (manifest, Watermark::open(dir)?),
             None => create(dir, spec)?,
@@ -192,7 +193,10 @@ impl Log {
             return Ok(fresh);
         }
         if let Err(error) = self.commit(state) {
-            if !matches!(error, StoreError::Full { .. }) {
+            if matches!(error, StoreError::Full { .. }) {
+                // The index may have had no room either, and now has.
+                self.evict();
+            } else {
                 self.failed = Some(error.to_string());
             }
             return Err(error);

@@ -150,11 +150,6 @@ impl Records {
         self.at
     }
 
-    /// Where the file ends.
-    pub(crate) fn end(&self) -> usize {
-        self.file.len()
-    }
-
     /// The record at `at`, and where it ends.
     fn record(&self, at: usize) -> Option<(Record, usize)> {
         let (frame, rest) = self.file.get(at..)?.split_first_chunk::<FRAME_BYTES>()?;

@@ -98,8 +98,8 @@ impl Recovered {
             let number = self.state.segments;
             let record = match record {
                 Ok(record) => record,
-                // Killed while it was written: nothing follows, and nobody was told of it.
-                Err(_) if newest && number >= acknowledged && records.next().is_none() => break,
+                // Cut off while it was written: nobody was told of it, nor of what may follow.
+                Err(_) if newest && number >= acknowledged => break,
                 Err(torn) => {
                     return Err(damaged(format!(
                         "bytes {} to {} are no whole segment (it should be segment {number})",

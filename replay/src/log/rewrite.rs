@@ -2,15 +2,20 @@
 
 use super::survey::{Found, Survey};
 use super::{FOLDERS, Log, State, lock};
-use crate::config::ReplayConfig;
+use crate::config::{ReplayConfig, SyncMode};
 use crate::error::StoreError;
 use getup_proto::Segment;
 use serde::Serialize;
-use std::fs;
+use std::fs::{self, File};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Where the new log is put together.
 const UNFINISHED: &str = "rewriting";
+/// In it: the new log is whole, and where the old one goes.
+const COMPLETE: &str = "complete";
+/// Where the old log goes before it is removed.
+const REPLACED: &str = "replaced";
 /// Segments that are written at once.
 const GROUP: usize = 64;
 
@@ -40,10 +45,10 @@ pub fn repair(dir: &Path) -> Result<Rewritten, StoreError> {
         return Ok(Rewritten { found: found.survey, segments, transitions, old: None });
     }
     let (segments, transitions) = rewrite(dir, &found, 0)?;
-    let old = (1..).map(|n| dir.join(format!("damaged-{n}"))).find(|path| !path.exists());
-    let old = old.expect("there is a name left");
-    fs::create_dir(&old).map_err(StoreError::io("create", &old))?;
-    swap(dir, Some(&old))?;
+    let mut names = (1..).map(|n| format!("damaged-{n}"));
+    let name = names.find(|name| !dir.join(name).exists()).expect("there is a name left");
+    swap(dir, Some(&name))?;
+    let old = dir.join(name);
     Ok(Rewritten { found: found.survey, segments, transitions, old: Some(old) })
 }
 
@@ -66,8 +71,11 @@ pub fn compact(dir: &Path, keep: Option<u64>) -> Result<Rewritten, StoreError> {
 
 /// All that a new log needs to know; an index that cannot be read now would cost it the marks.
 fn survey(dir: &Path) -> Result<Found, StoreError> {
-    // The lock is let go before, as the index is read under it.
-    drop(lock(dir)?);
+    {
+        // Let go before the survey, as the index is read under it.
+        let _lock = lock(dir)?;
+        finish(dir)?;
+    }
     let mut found = Found::read(dir, |_, _| {})?;
     found.unread.take().map_or(Ok(found), Err)
 }
@@ -82,7 +90,12 @@ fn rewrite(dir: &Path, found: &Found, excess: u64) -> Result<(u64, u64), StoreEr
     // Just enough that nothing is evicted from it, and that its files are of the usual share.
     let Survey { spec, transitions, .. } = &found.survey;
     let capacity = (transitions - excess).max(2 * spec.max_segment_steps as u64);
-    let config = ReplayConfig { capacity: capacity as usize, min_size: 1, ..ReplayConfig::default() };
+    let config = ReplayConfig {
+        capacity: capacity as usize,
+        min_size: 1,
+        sync: SyncMode::Data,
+        ..ReplayConfig::default()
+    };
     let mut writing = Writing {
         dir: unfinished,
         found,
@@ -165,23 +178,49 @@ impl Writing<'_> {
     }
 }
 
-/// Puts the new log in the old one's place, and that to `aside`, or away.
-fn swap(dir: &Path, aside: Option<&Path>) -> Result<(), StoreError> {
+/// Puts the new log in the old one's place, and that to the folder `aside`, or away. From the marker on, a process that
+/// is killed leaves what the next one finishes.
+fn swap(dir: &Path, aside: Option<&str>) -> Result<(), StoreError> {
+    let (unfinished, marker) = (dir.join(UNFINISHED), dir.join(UNFINISHED).join(COMPLETE));
+    sync(&unfinished)?;
+    let write = || {
+        let mut file = File::create(&marker)?;
+        file.write_all(aside.unwrap_or_default().as_bytes())?;
+        file.sync_all()
+    };
+    write().map_err(StoreError::io("write", &marker))?;
+    sync(&unfinished)?;
+    finish(dir)
+}
+
+/// Finishes a swap that was begun, if one was. The store must be locked.
+pub(super) fn finish(dir: &Path) -> Result<(), StoreError> {
     let unfinished = dir.join(UNFINISHED);
-    let replaced = aside.map_or_else(|| dir.join("replaced"), Path::to_owned);
-    if aside.is_none() {
-        fs::create_dir(&replaced).map_err(StoreError::io("create", &replaced))?;
+    let marker = unfinished.join(COMPLETE);
+    if !marker.exists() {
+        return Ok(());
     }
+    let aside = fs::read_to_string(&marker).map_err(StoreError::io("read", &marker))?;
+    let replaced = dir.join(if aside.is_empty() { REPLACED } else { &aside });
+    fs::create_dir_all(&replaced).map_err(StoreError::io("create", &replaced))?;
     for name in FOLDERS {
         let (old, new) = (dir.join(name), unfinished.join(name));
-        if old.exists() {
-            fs::rename(&old, replaced.join(name)).map_err(StoreError::io("move", &old))?;
+        // Where the new one is gone, it is in place already.
+        if new.exists() {
+            if old.exists() {
+                fs::rename(&old, replaced.join(name)).map_err(StoreError::io("move", &old))?;
+            }
+            fs::rename(&new, &old).map_err(StoreError::io("move", &new))?;
         }
-        fs::rename(&new, &old).map_err(StoreError::io("move", &new))?;
     }
-    fs::remove_dir_all(&unfinished).map_err(StoreError::io("remove", &unfinished))?;
-    if aside.is_none() {
+    sync(dir)?;
+    if aside.is_empty() {
         fs::remove_dir_all(&replaced).map_err(StoreError::io("remove", &replaced))?;
     }
-    Ok(())
+    fs::remove_dir_all(&unfinished).map_err(StoreError::io("remove", &unfinished))
+}
+
+/// Makes the names in a folder durable.
+fn sync(folder: &Path) -> Result<(), StoreError> {
+    File::open(folder).and_then(|file| file.sync_all()).map_err(StoreError::io("sync", folder))
 }

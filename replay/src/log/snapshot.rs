@@ -1,9 +1,10 @@
 //! A copy of a store that is being written: [`Snapshot`].
 //!
-//! Files that are full never change, so the copy shares them (hard links). Of the newest file what is committed never
-//! changes either: only links and marks are taken while appends wait; the rest is copied afterwards.
+//! All files but the newest never change again, so the copy shares them (hard links). Of the newest what is committed
+//! never changes either, but more may follow, here and in the copy: it is copied, and only links and marks are taken while
+//! appends wait.
 
-use super::files::{self, Tail};
+use super::files;
 use super::index::{Content, Index};
 use super::manifest::Manifest;
 use super::record::Mark;
@@ -26,7 +27,7 @@ pub(crate) struct Snapshot {
     marks: Vec<(u64, Mark)>,
     sampled: u64,
     /// The newest file, and how many bytes of it count.
-    tail: Option<(u64, File, u64)>,
+    newest: Option<(u64, File, u64)>,
 }
 
 impl Log {
@@ -36,30 +37,34 @@ impl Log {
             let exists = io::Error::from(io::ErrorKind::AlreadyExists);
             return Err(StoreError::io("create", dir)(exists));
         }
-        let unfinished = dir.with_extension("unfinished");
+        // No snapshot can be called so: a name that begins with a dot is refused.
+        let name = dir.file_name().unwrap_or_default().to_string_lossy();
+        let unfinished = dir.with_file_name(format!(".{name}.unfinished"));
         if unfinished.exists() {
             fs::remove_dir_all(&unfinished).map_err(StoreError::io("remove", &unfinished))?;
         }
         let segments = unfinished.join(files::FOLDER);
         fs::create_dir_all(&segments).map_err(StoreError::io("create", &segments))?;
-        let open = self.tail.is_some();
-        let full = self.files.len() - usize::from(open);
+        let full = self.files.len().saturating_sub(1);
         for file in self.files.iter().take(full) {
             let (from, to) = (files::path(&self.dir, file.first), files::path(&unfinished, file.first));
             fs::hard_link(&from, &to).map_err(StoreError::io("link", from))?;
         }
-        let tail = self.tail.as_ref().zip(self.files.back());
-        let read = |(tail, held): (&Tail, &super::Held)| {
-            Ok::<_, StoreError>((held.first, tail.reader()?, tail.bytes()))
+        let read = |newest: &super::Held| {
+            let path = files::path(&self.dir, newest.first);
+            // It stays readable when it is dropped.
+            let opened = File::open(&path).and_then(|file| Ok((file.metadata()?.len(), file)));
+            let (bytes, file) = opened.map_err(StoreError::io("open", path))?;
+            Ok::<_, StoreError>((newest.first, file, bytes))
         };
-        let tail = tail.map(read).transpose()?;
+        let newest = self.files.back().map(read).transpose()?;
         Ok(Snapshot {
             unfinished,
             dir: dir.to_owned(),
             state: self.state,
             marks: self.writers.iter().collect(),
             sampled: self.watermark.sampled()?,
-            tail,
+            newest,
         })
     }
 }
@@ -72,8 +77,8 @@ impl Snapshot {
 
     /// Copies the rest, and gives the snapshot its name: it is there whole, or not at all.
     pub(crate) fn finish(self, spec: &RunSpec) -> Result<(), StoreError> {
-        let Self { unfinished, dir, state, marks, sampled, tail } = self;
-        if let Some((first, file, bytes)) = tail {
+        let Self { unfinished, dir, state, marks, sampled, newest } = self;
+        if let Some((first, file, bytes)) = newest {
             let to = files::path(&unfinished, first);
             let copy = || io::copy(&mut file.take(bytes), &mut File::create_new(&to)?);
             copy().map_err(StoreError::io("write", &to))?;
@@ -86,12 +91,5 @@ impl Snapshot {
         watermark.set_sampled(sampled)?;
         Manifest::new(spec).write(&unfinished)?;
         fs::rename(&unfinished, &dir).map_err(StoreError::io("move", &dir))
-    }
-}
-
-impl Tail {
-    /// Another handle, to read what is committed: it stays readable when the file is dropped.
-    fn reader(&self) -> Result<File, StoreError> {
-        File::open(self.path()).map_err(StoreError::io("open", self.path()))
     }
 }

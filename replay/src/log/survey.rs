@@ -104,6 +104,8 @@ impl Found {
             .and_then(|watermark| watermark.acknowledged().map_err(|error| error.to_string()));
         let sampled = watermark.ok().and_then(|watermark| watermark.sampled().ok());
         let mut reading = Reading {
+            acknowledged: acknowledged.as_ref().ok().copied(),
+            oldest: 0,
             dir,
             spec: &manifest.spec,
             before: None,
@@ -188,6 +190,10 @@ pub fn segments(
 
 struct Reading<'a, V> {
     dir: &'a Path,
+    /// Segments that were; none where that is not known.
+    acknowledged: Option<u64>,
+    /// Number of the oldest segment that is kept; what lies before is on its way out.
+    oldest: u64,
     spec: &'a RunSpec,
     /// Totals before the first segment that is there.
     before: Option<State>,
@@ -210,6 +216,7 @@ impl<V: FnMut(State, Segment)> Reading<'_, V> {
         match Index::open(self.dir, SyncMode::Process) {
             Ok((_, content)) => {
                 content.marks.into_iter().for_each(|(writer, mark)| self.writers.restore(writer, mark));
+                self.oldest = content.oldest;
             }
             Err(error @ StoreError::Damaged { .. }) => self.survey.damages.push(what(error)),
             Err(error) => self.unread = Some(error),
@@ -221,7 +228,8 @@ impl<V: FnMut(State, Segment)> Reading<'_, V> {
             self.survey.damages.push(format!("its folder `{}` is missing", files::FOLDER));
             return Ok(());
         }
-        let firsts = files::list(self.dir)?;
+        let mut firsts = files::list(self.dir)?;
+        firsts.retain(|&first| first >= self.oldest);
         for (place, &first) in firsts.iter().enumerate() {
             self.read_file(first, place + 1 == firsts.len());
         }
@@ -241,12 +249,19 @@ impl<V: FnMut(State, Segment)> Reading<'_, V> {
             None if newest && content.len() < record::HEADER_BYTES => return,
             None => self.damage(first, "its header cannot be read"),
         }
-        let mut records = Records::new(content);
-        while let Some(record) = records.next() {
+        for record in Records::new(content) {
             let segment = match record {
-                Ok(record) => record.segment(self.spec),
-                // Not acknowledged, or the watermark says so.
-                Err(_) if newest && records.position() == records.end() => return,
+                // Bytes that look like a record in another one's body.
+                Ok(record) if record.number < self.state.segments => {
+                    self.damage(first, &format!("segment {} comes twice", record.number));
+                    continue;
+                }
+                Ok(record) => {
+                    self.state.segments = record.number;
+                    record.segment(self.spec)
+                }
+                // Cut off while it was written, and not acknowledged.
+                Err(_) if newest && self.is_unacknowledged() => return,
                 Err(torn) => {
                     let bytes = torn.bytes;
                     self.damage(
@@ -261,6 +276,11 @@ impl<V: FnMut(State, Segment)> Reading<'_, V> {
                 Err(error) => self.damage(first, &format!("a segment cannot be read ({error})")),
             }
         }
+    }
+
+    /// Whether what comes next was not acknowledged, as far as the watermark says.
+    fn is_unacknowledged(&self) -> bool {
+        self.acknowledged.is_some_and(|acknowledged| self.state.segments >= acknowledged)
     }
 
     /// Goes on with a file that begins after the totals `header`.

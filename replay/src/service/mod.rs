@@ -38,6 +38,8 @@ const PING_EVERY: Duration = Duration::from_secs(10);
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
 /// Where snapshots go, in the store's folder.
 const SNAPSHOTS: &str = "snapshots";
+/// Priorities of a request: they are given under a lock that appends and samples wait for.
+const MOST_PRIORITIES: usize = 1 << 17;
 /// Replies that may wait for a client that is not reading.
 const REPLIES: usize = 2;
 
@@ -98,8 +100,8 @@ pub async fn serve(
     };
     tokio::select! {
         served = serving => served?,
-        // While its queue has a sender, a committer ends only when its store does.
-        Some(committed) = committing.join_next() => return Ok(committed??),
+        // While its queue has a sender, a committer ends only when its store does, or finds the disk full at the end.
+        Some(committed) = committing.join_next() => committed??,
         () = out_of_patience => tracing::warn!("replay ends with streams open: their clients did not let go"),
     }
     // A committer ends once it has worked off its queue and all streams, which hold the other end, are gone.
@@ -209,6 +211,12 @@ impl Replay for Service {
         request: Request<v1::UpdatePrioritiesRequest>,
     ) -> Result<Response<v1::UpdatePrioritiesReply>, Status> {
         let v1::UpdatePrioritiesRequest { keys, priorities, table } = request.into_inner();
+        if keys.len() > MOST_PRIORITIES {
+            let keys = keys.len();
+            return Err(Status::invalid_argument(format!(
+                "{keys} priorities came at once: send {MOST_PRIORITIES} at most"
+            )));
+        }
         if keys.len() != priorities.len() {
             let (keys, priorities) = (keys.len(), priorities.len());
             return Err(Status::invalid_argument(format!(
