@@ -113,10 +113,17 @@ pub(crate) fn scrape(address: &str) -> Option<String> {
     head.starts_with("HTTP/1.1 200").then(|| body.to_owned())
 }
 
-/// A sample without labels of `/metrics`.
+/// The first sample of this name in `/metrics`.
 pub(crate) fn metric(address: &str, name: &str) -> Option<f64> {
     let text = scrape(address)?;
-    text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' ')?.parse().ok())
+    let value = |line: &str| {
+        let rest = line.strip_prefix(name)?;
+        // Behind its labels, where it has some.
+        let value =
+            rest.strip_prefix('{').map_or(rest.strip_prefix(' '), |labels| Some(labels.split_once("} ")?.1));
+        value?.parse().ok()
+    };
+    text.lines().find_map(value)
 }
 
 /// Waits until `condition` gives something, at most `limit`; `what` names it where it does not.
