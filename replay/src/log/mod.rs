@@ -49,6 +49,7 @@ use std::collections::VecDeque;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::thread;
 use std::time::{Duration, Instant};
 use writers::Writers;
 
@@ -56,6 +57,8 @@ use writers::Writers;
 const FOLDERS: [&str; 3] = [files::FOLDER, index::FOLDER, watermark::FILE];
 /// Files that make up the capacity, at least.
 const FILES: u64 = 16;
+/// How long to ask for the lock of a store that is held.
+const LOCK_PATIENCE: Duration = Duration::from_secs(1);
 /// How long the oldest file stays where the index could not be written.
 const EVICT_AGAIN: Duration = Duration::from_secs(5);
 
@@ -300,7 +303,19 @@ fn bytes_in(path: &Path) -> u64 {
     entries.flatten().map(|entry| bytes_in(&entry.path())).sum()
 }
 
+/// Locks the store for this process. One that is held is asked for again for a moment: whoever inspects a store holds it
+/// briefly, and so does a process that was just forked, until it becomes another program.
 fn lock(dir: &Path) -> Result<File, StoreError> {
+    let give_up = Instant::now() + LOCK_PATIENCE;
+    loop {
+        match try_lock(dir) {
+            Err(StoreError::InUse { .. }) if Instant::now() < give_up => thread::sleep(LOCK_PATIENCE / 50),
+            result => return result,
+        }
+    }
+}
+
+fn try_lock(dir: &Path) -> Result<File, StoreError> {
     let path = dir.join("lock");
     let file = File::create(&path).map_err(StoreError::io("create", &path))?;
     match file.try_lock() {

@@ -8,7 +8,7 @@ use super::index::{self, Index};
 use super::manifest::Manifest;
 use super::record::{self, Mark, Records, State};
 use super::watermark::Watermark;
-use super::{Writers, disk_bytes, lock};
+use super::{Writers, disk_bytes, try_lock};
 use crate::config::SyncMode;
 use crate::error::StoreError;
 use getup_proto::{RunSpec, Segment};
@@ -212,7 +212,7 @@ impl<V: FnMut(State, Segment)> Reading<'_, V> {
             self.survey.damages.push(format!("its folder `{}` is missing", index::FOLDER));
             return;
         }
-        let Ok(_lock) = lock(self.dir) else { return };
+        let Ok(_lock) = try_lock(self.dir) else { return };
         match Index::open(self.dir, SyncMode::Process) {
             Ok((_, content)) => {
                 content.marks.into_iter().for_each(|(writer, mark)| self.writers.restore(writer, mark));
