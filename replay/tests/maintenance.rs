@@ -54,6 +54,10 @@ fn a_survey_counts_what_is_there_and_what_ever_was() {
 
     let nothing = Survey::read(&dir.path().join("segments"), |_| {}).unwrap_err().to_string();
     assert!(nothing.contains("no replay store") && nothing.contains("store.json"), "{nothing}");
+    let nowhere = dir.path().join("nowhere");
+    let nothing = repair(&nowhere).unwrap_err().to_string();
+    assert!(nothing.contains("no replay store"), "{nothing}");
+    assert!(!nowhere.exists() && !dir.path().join("segments/lock").exists(), "looking leaves nothing behind");
 }
 
 #[test]

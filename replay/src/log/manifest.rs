@@ -40,8 +40,13 @@ impl Manifest {
         Ok(manifest)
     }
 
+    /// Of the store that must be in `dir`, whatever it holds.
+    pub(crate) fn existing(dir: &Path) -> Result<Self, StoreError> {
+        Self::load(dir)?.ok_or_else(|| StoreError::NoStore { dir: dir.to_owned() })
+    }
+
     /// Of the store in `dir`, where there is one, whatever it holds.
-    pub(crate) fn load(dir: &Path) -> Result<Option<Self>, StoreError> {
+    fn load(dir: &Path) -> Result<Option<Self>, StoreError> {
         let path = dir.join(FILE);
         if !path.try_exists().map_err(StoreError::io("read", &path))? {
             return Ok(None);

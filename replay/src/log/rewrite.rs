@@ -1,5 +1,6 @@
 //! Writing a store anew from what is whole of it: [`repair`] and [`compact`].
 
+use super::manifest::Manifest;
 use super::survey::{Found, Survey};
 use super::{FOLDERS, Log, State, lock};
 use crate::config::{ReplayConfig, SyncMode};
@@ -38,13 +39,14 @@ pub struct Rewritten {
 /// # Errors
 /// [`StoreError`] if it is in use, or is no store; nothing has changed then.
 pub fn repair(dir: &Path) -> Result<Rewritten, StoreError> {
-    let found = survey(dir)?;
-    let _lock = lock(dir)?;
+    Manifest::existing(dir)?;
+    let lock = lock(dir)?;
+    let found = survey(dir, &lock)?;
     if found.survey.damages.is_empty() {
         let (segments, transitions) = (found.survey.segments, found.survey.transitions);
         return Ok(Rewritten { found: found.survey, segments, transitions, old: None });
     }
-    let (segments, transitions) = rewrite(dir, &found, 0)?;
+    let (segments, transitions) = rewrite(dir, &lock, &found, 0)?;
     let mut names = (1..).map(|n| format!("damaged-{n}"));
     let name = names.find(|name| !dir.join(name).exists()).expect("there is a name left");
     swap(dir, Some(&name))?;
@@ -58,31 +60,28 @@ pub fn repair(dir: &Path) -> Result<Rewritten, StoreError> {
 /// # Errors
 /// [`StoreError`] if it is in use, damaged, or no store; nothing has changed then.
 pub fn compact(dir: &Path, keep: Option<u64>) -> Result<Rewritten, StoreError> {
-    let found = survey(dir)?;
-    let _lock = lock(dir)?;
+    Manifest::existing(dir)?;
+    let lock = lock(dir)?;
+    let found = survey(dir, &lock)?;
     if let Some(damage) = found.survey.damages.first() {
         return Err(StoreError::damaged(dir, damage));
     }
     let excess = keep.map_or(0, |keep| found.survey.transitions.saturating_sub(keep));
-    let (segments, transitions) = rewrite(dir, &found, excess)?;
+    let (segments, transitions) = rewrite(dir, &lock, &found, excess)?;
     swap(dir, None)?;
     Ok(Rewritten { found: found.survey, segments, transitions, old: None })
 }
 
 /// All that a new log needs to know; an index that cannot be read now would cost it the marks.
-fn survey(dir: &Path) -> Result<Found, StoreError> {
-    {
-        // Let go before the survey, as the index is read under it.
-        let _lock = lock(dir)?;
-        finish(dir)?;
-    }
-    let mut found = Found::read(dir, |_, _| {})?;
+fn survey(dir: &Path, lock: &File) -> Result<Found, StoreError> {
+    finish(dir)?;
+    let mut found = Found::read(dir, Some(lock), |_, _| {})?;
     found.unread.take().map_or(Ok(found), Err)
 }
 
 /// Puts a new log together, without the oldest segments that make up to `excess` transitions; returns its segments
 /// and transitions.
-fn rewrite(dir: &Path, found: &Found, excess: u64) -> Result<(u64, u64), StoreError> {
+fn rewrite(dir: &Path, lock: &File, found: &Found, excess: u64) -> Result<(u64, u64), StoreError> {
     let unfinished = dir.join(UNFINISHED);
     if unfinished.exists() {
         fs::remove_dir_all(&unfinished).map_err(StoreError::io("remove", &unfinished))?;
@@ -106,7 +105,7 @@ fn rewrite(dir: &Path, found: &Found, excess: u64) -> Result<(u64, u64), StoreEr
         state: State::default(),
         error: None,
     };
-    Found::read(dir, |before, segment| writing.take(before, segment))?;
+    Found::read(dir, Some(lock), |before, segment| writing.take(before, segment))?;
     writing.finish()
 }
 

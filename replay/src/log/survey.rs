@@ -1,7 +1,6 @@
 //! Reading a store that may be damaged or in use: [`Survey`].
 //!
-//! Nothing is changed, and nothing is locked: a store may be written meanwhile. What it drops or adds while it is
-//! read is not taken for damage.
+//! Nothing is changed, and a store may be written meanwhile: what it adds while it is read is not taken for damage.
 
 use super::files;
 use super::index::{self, Index};
@@ -13,6 +12,7 @@ use crate::config::SyncMode;
 use crate::error::StoreError;
 use getup_proto::{RunSpec, Segment};
 use serde::Serialize;
+use std::fs::File;
 use std::path::Path;
 
 /// What a store's folder holds.
@@ -75,7 +75,11 @@ impl Survey {
     /// [`StoreError`] if there is no store, or so little of one that its transitions cannot be known: damage beyond
     /// that is told in [`Survey::damages`].
     pub fn read(dir: &Path, mut visit: impl FnMut(Segment)) -> Result<Self, StoreError> {
-        Ok(Found::read(dir, |_, segment| visit(segment))?.survey)
+        // A folder that is no store gets no lock file.
+        Manifest::existing(dir)?;
+        // sled locks its folder: a store in use keeps its index to itself.
+        let lock = try_lock(dir).ok();
+        Ok(Found::read(dir, lock.as_ref(), |_, segment| visit(segment))?.survey)
     }
 }
 
@@ -91,11 +95,14 @@ pub(super) struct Found {
 }
 
 impl Found {
-    /// As [`Survey::read`]; `visit` also gets the totals before the segment.
-    pub(super) fn read(dir: &Path, visit: impl FnMut(State, Segment)) -> Result<Self, StoreError> {
-        let Some(manifest) = Manifest::load(dir)? else {
-            return Err(StoreError::NoStore { dir: dir.to_owned() });
-        };
+    /// As [`Survey::read`]; `visit` also gets the totals before the segment. The index is read under the store's `lock`
+    /// alone.
+    pub(super) fn read(
+        dir: &Path,
+        lock: Option<&File>,
+        visit: impl FnMut(State, Segment),
+    ) -> Result<Self, StoreError> {
+        let manifest = Manifest::existing(dir)?;
         // Asked before the files are read: what is acknowledged later may be in none of them.
         let watermark = Watermark::open(dir);
         let acknowledged = watermark
@@ -129,7 +136,9 @@ impl Found {
             unread: None,
             visit,
         };
-        reading.read_index();
+        if lock.is_some() {
+            reading.read_index();
+        }
         reading.read_files()?;
         let Reading { state, writers, mut survey, unread, .. } = reading;
         match acknowledged {
@@ -156,9 +165,7 @@ impl Found {
 pub fn segments(
     dir: &Path,
 ) -> Result<(RunSpec, impl Iterator<Item = Result<Segment, StoreError>>), StoreError> {
-    let Some(manifest) = Manifest::load(dir)? else {
-        return Err(StoreError::NoStore { dir: dir.to_owned() });
-    };
+    let manifest = Manifest::existing(dir)?;
     let firsts = files::list(dir)?;
     let newest = firsts.last().copied();
     let (dir, spec) = (dir.to_owned(), manifest.spec.clone());
@@ -206,13 +213,12 @@ struct Reading<'a, V> {
 }
 
 impl<V: FnMut(State, Segment)> Reading<'_, V> {
-    /// The marks of writers whose segments are gone. sled locks its folder: a store in use keeps them to itself.
+    /// The marks of writers whose segments are gone, and where the log begins.
     fn read_index(&mut self) {
         if !self.dir.join(index::FOLDER).is_dir() {
             self.survey.damages.push(format!("its folder `{}` is missing", index::FOLDER));
             return;
         }
-        let Ok(_lock) = try_lock(self.dir) else { return };
         match Index::open(self.dir, SyncMode::Process) {
             Ok((_, content)) => {
                 content.marks.into_iter().for_each(|(writer, mark)| self.writers.restore(writer, mark));
