@@ -45,7 +45,10 @@ async fn serve(config: &Config, role: &Role, diverged: PathBuf) -> Result<()> {
     let setup = setup(config, identity.clone(), diverged)?;
     let network = &config.network;
     let waits = &role.waits;
-    let writer = GrpcReplay::new(&url(&network.replay), setup.spec.clone(), identity, waits.clone())?;
+    let writer = |(index, address): (usize, &String)| {
+        GrpcReplay::new(&url(address), setup.spec.clone(), identity.towards(index), waits.clone())
+    };
+    let writers = network.replays().iter().enumerate().map(writer).collect::<Result<Vec<_>, _>>()?;
     let link =
         GrpcLearner::new(&url(&network.learner), setup.spec.clone(), &config.actor.name, waits.clone())?;
     role.serve_metrics(&network.actor_metrics).await?;
@@ -53,7 +56,8 @@ async fn serve(config: &Config, role: &Role, diverged: PathBuf) -> Result<()> {
     tracing::info!(name = config.actor.name, health = %listener.local_addr()?, "actor started");
     let (_reporter, health) = health();
     let server = tokio::spawn(serve_grpc(grpc_server().add_service(health), listener, role.shutdown.clone()));
-    let result = worker::run(setup, writer, link, waits.clone(), role.shutdown.clone(), &role.registry).await;
+    let result =
+        worker::run(setup, writers, link, waits.clone(), role.shutdown.clone(), &role.registry).await;
     role.shutdown.trigger();
     server.await??;
     Ok(result?)

@@ -66,7 +66,8 @@ impl Default for ReplayTable {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub(crate) struct NetworkConfig {
-    /// The replay's gRPC address: it listens there, the others connect there.
+    /// The replay's gRPC address: it listens there, the others connect there. Of several replays all, separated by
+    /// commas; `getup replay --shard N` says which one is which.
     pub(crate) replay: String,
     /// The learner's gRPC address, likewise.
     pub(crate) learner: String,
@@ -78,6 +79,25 @@ pub(crate) struct NetworkConfig {
     pub(crate) learner_metrics: String,
     /// See `replay_metrics`.
     pub(crate) actor_metrics: String,
+}
+
+impl NetworkConfig {
+    /// The addresses of all replays.
+    pub(crate) fn replays(&self) -> Vec<String> {
+        self.replay.split(',').map(|address| address.trim().to_owned()).collect()
+    }
+
+    fn validate(&self) -> Result<()> {
+        let replays = self.replays();
+        for (index, address) in replays.iter().enumerate() {
+            ensure!(
+                !address.is_empty() && !replays[..index].contains(address),
+                "network.replay = {:?}: one address of each replay, such as replay-0:7401,replay-1:7401",
+                self.replay
+            );
+        }
+        Ok(())
+    }
 }
 
 impl Default for NetworkConfig {
@@ -177,7 +197,8 @@ impl Config {
             self.sac.uniform_steps,
             self.replay.capacity
         );
-        self.replay_config().validate_for(&self.run_spec()?)?;
+        self.network.validate()?;
+        self.replay_config(self.network.replays().len()).validate_for(&self.run_spec()?)?;
         self.sac.validate()?;
         self.curriculum.validate()?;
         self.evaluation.validate()?;
@@ -196,15 +217,17 @@ impl Config {
         toml::to_string_pretty(self).context("the configuration is not expressible in TOML")
     }
 
-    /// The replay's settings: it is sampled as often as `[sac]` says, once its uniform steps are there.
-    pub(crate) fn replay_config(&self) -> ReplayConfig {
+    /// The settings of one of so many replays: they are sampled as often as `[sac]` says, once its uniform steps are
+    /// there, each with its part of them.
+    pub(crate) fn replay_config(&self, replays: usize) -> ReplayConfig {
         let samples_per_insert = self.sac.updates_per_step * self.sac.batch as f64;
-        let middle = self.sac.uniform_steps as f64 * samples_per_insert;
+        let min_size = self.sac.uniform_steps.div_ceil(replays as u64).max(1);
+        let middle = min_size as f64 * samples_per_insert;
         let segment = self.actor.segment_steps as f64 * samples_per_insert;
         ReplayConfig {
             capacity: self.replay.capacity,
             sync: self.replay.sync,
-            min_size: self.sac.uniform_steps.max(1),
+            min_size,
             samples_per_insert: Some(samples_per_insert),
             // A tenth of the first minibatches, and room for two of the longest segments and for a minibatch.
             error_buffer: Some((0.1 * middle).max(2.0 * segment).max(2.0 * self.sac.batch as f64)),

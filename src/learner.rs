@@ -12,7 +12,7 @@ use getup_learner::run_folder::{RunFolder, write_atomically};
 use getup_learner::sac::TaskShape;
 use getup_learner::service::service;
 use getup_learner::trainer::{Ending, Start, Trainer, TrainerConfig};
-use getup_replay::{RemoteOptions, RemoteSource, SampleOptions};
+use getup_replay::{RemoteOptions, SampleOptions, ShardedSource};
 use getup_sim::{GetUp, Task};
 use getup_telemetry::health;
 use rand::{RngCore, SeedableRng};
@@ -73,7 +73,7 @@ async fn serve(
     let server = grpc_server().add_service(health).add_service(service(hub, role.shutdown.clone()));
     let server = tokio::spawn(serve_grpc(server, listener, role.shutdown.clone()));
     let options = RemoteOptions {
-        endpoint: config.network.replay.clone(),
+        endpoint: String::new(),
         spec: config.run_spec()?,
         sample: sample_options(config, incarnation),
         name: "learner".into(),
@@ -81,7 +81,8 @@ async fn serve(
         prefetch: PREFETCH,
     };
     let runtime = tokio::runtime::Handle::current();
-    let mut source = RemoteSource::new(options, &runtime, role.waits.clone(), role.shutdown.clone());
+    let (replays, waits, shutdown) = (config.network.replays(), role.waits.clone(), role.shutdown.clone());
+    let mut source = ShardedSource::new(&replays, &options, &runtime, waits, shutdown);
     let shutdown = role.shutdown.clone();
     let result = tokio::task::spawn_blocking(move || trainer.run(&mut source, &shutdown)).await?;
     match &result {

@@ -39,6 +39,10 @@ impl Drop for StoreWriter {
 }
 
 impl SegmentWriter for StoreWriter {
+    fn writer(&self) -> u64 {
+        self.writer
+    }
+
     async fn append(&mut self, segments: Vec<Segment>) -> Result<(), LinkError> {
         let (store, shutdown) = (Arc::clone(&self.store), self.shutdown.clone());
         let append = move || {

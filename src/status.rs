@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
+use futures::future::join_all;
 use getup_proto::v1;
 use getup_proto::v1::learner_client::LearnerClient;
 use serde_json::json;
@@ -25,25 +26,34 @@ pub(crate) struct Args {
 #[tokio::main(flavor = "current_thread")]
 pub(crate) async fn run(arguments: Args) -> Result<()> {
     let config = arguments.config.load()?;
-    let (replay, learner) = (&config.network.replay, &config.network.learner);
-    let (replay, learner) = tokio::join!(ask_replay(replay), ask_learner(learner));
+    let replays = config.network.replays();
+    let asking = join_all(replays.iter().map(|address| ask_replay(address)));
+    let (replays, learner) = tokio::join!(asking, ask_learner(&config.network.learner));
     if arguments.json {
-        let replay = replay.as_ref().map_or_else(|error| json!({"error": format!("{error:#}")}), replay_json);
+        let replay = |replay: &Result<_>| {
+            replay.as_ref().map_or_else(|error| json!({"error": format!("{error:#}")}), replay_json)
+        };
+        let replay = match replays.as_slice() {
+            [one] => replay(one),
+            several => several.iter().map(replay).collect(),
+        };
         let learner =
             learner.as_ref().map_or_else(|error| json!({"error": format!("{error:#}")}), learner_json);
         println!("{}", json!({"replay": replay, "learner": learner}));
         return Ok(());
     }
-    match &replay {
-        Ok(reply) => print_replay(reply),
-        Err(error) => println!("replay   not reached: {error:#}"),
+    for replay in &replays {
+        match replay {
+            Ok(reply) => print_replay(reply),
+            Err(error) => println!("replay   not reached: {error:#}"),
+        }
     }
     match &learner {
         Ok(reply) => print_learner(reply),
         Err(error) => println!("learner  not reached: {error:#}"),
     }
     anyhow::ensure!(
-        replay.is_ok() || learner.is_ok(),
+        learner.is_ok() || replays.iter().any(Result::is_ok),
         "no role answers: is the cluster running? (`getup train` shows its waits itself)"
     );
     Ok(())

@@ -181,7 +181,8 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_
     let mut acting = {
         let role = role.clone();
         tokio::spawn(async move {
-            worker::run(setup, writer, link, role.waits.clone(), role.shutdown.clone(), &role.registry).await
+            worker::run(setup, vec![writer], link, role.waits.clone(), role.shutdown.clone(), &role.registry)
+                .await
         })
     };
     let shutdown = role.shutdown.clone();
@@ -205,7 +206,7 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_
 fn open_store(config: &Config, role: &Role, folder: &RunFolder) -> Result<Arc<Store>> {
     let spec = config.run_spec()?;
     let metrics = ReplayMetrics::new(&role.registry);
-    let store = Store::open(&folder.replay(), &spec, &config.replay_config(), metrics, role.waits.clone())?;
+    let store = Store::open(&folder.replay(), &spec, &config.replay_config(1), metrics, role.waits.clone())?;
     Ok(Arc::new(store))
 }
 

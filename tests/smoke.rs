@@ -8,55 +8,10 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use common::{Process, free_address, getup, metric, scrape, succeed, wait_for};
+use common::{Cluster, getup, metric, scrape, succeed, wait_for};
 use serde_json::Value;
 
 const LIMIT: Duration = Duration::from_secs(60);
-
-/// Addresses and folder of one cluster.
-struct Cluster {
-    folder: tempfile::TempDir,
-    addresses: [(&'static str, String); 5],
-}
-
-impl Cluster {
-    fn new() -> Self {
-        let names = ["replay", "learner", "replay_metrics", "learner_metrics", "actor_metrics"];
-        Self { folder: tempfile::tempdir().unwrap(), addresses: names.map(|name| (name, free_address())) }
-    }
-
-    fn address(&self, name: &str) -> &str {
-        &self.addresses.iter().find(|(known, _)| *known == name).unwrap().1
-    }
-
-    fn path(&self) -> &Path {
-        self.folder.path()
-    }
-
-    /// A command of this cluster: preset, addresses, a curriculum that a limp body passes.
-    fn command(&self, role: &str, omega: f64) -> Command {
-        let mut command = getup(&[role, "--preset", "smoke", "--set", "run=smoke"]);
-        command.args(["--set", &format!("curriculum.omega={omega}")]);
-        for (name, address) in &self.addresses {
-            command.args(["--set", &format!("network.{name}={address}")]);
-        }
-        command.current_dir(self.path());
-        command
-    }
-
-    fn start(&self, role: &'static str, omega: f64) -> Process {
-        Process::start(role, self.path(), self.command(role, omega).args(["--log-format", "json"]))
-    }
-
-    fn learner_metric(&self, name: &str) -> Option<f64> {
-        metric(self.address("learner_metrics"), &format!("getup_learner_{name}"))
-    }
-
-    fn status(&self) -> Option<Value> {
-        let output = self.command("status", 1.0).arg("--json").output().unwrap();
-        serde_json::from_slice(&output.stdout).ok()
-    }
-}
 
 fn wait_for_at_least(cluster: &Cluster, name: &str, least: f64) -> f64 {
     wait_for(&format!("getup_learner_{name} >= {least}"), LIMIT, || {

@@ -21,6 +21,11 @@ impl Identity {
         Self { name: name.to_owned(), run_seed, writer: rand::random() }
     }
 
+    /// The same actor as the `index`th of several replays knows it: two addresses of one replay are two writers to it.
+    pub fn towards(&self, index: usize) -> Self {
+        Self { writer: self.writer.wrapping_add(index as u64), ..self.clone() }
+    }
+
     /// The generator of one episode, the same wherever and in whatever company it is played.
     ///
     /// `lane` and `episode` count from 0.

@@ -10,6 +10,7 @@
 //! | [`evaluate`] | [`Evaluator`]: episodes from seeded falls under the mean action |
 //! | [`link`] | [`SegmentWriter`] and [`LearnerLink`], and the typed values that pass through them |
 //! | [`grpc`] | both as gRPC clients |
+//! | `queue`, `spread` | the bounded queue of segments, and its way to one or several replays |
 //! | [`worker`] | [`run`]: the role, with its threads, its queue, heartbeats and shutdown |
 //! | [`config`], [`identity`], [`metrics`] | settings; who an actor is, and its random draws; what it counts |
 
@@ -27,6 +28,7 @@ mod office;
 mod pool;
 mod queue;
 pub mod segments;
+mod spread;
 pub mod worker;
 
 pub use config::{ActorConfig, ConfigError};

@@ -262,7 +262,10 @@ pub enum LinkError {
 }
 
 /// The way of segments to the replay.
-pub trait SegmentWriter: Send + 'static {
+pub trait SegmentWriter: Send + Sync + 'static {
+    /// The id under which the replay knows this writer: that of every segment appended here.
+    fn writer(&self) -> u64;
+
     /// Stores segments, whose sequence numbers go on where the last call's ended, and returns when all are durable.
     ///
     /// It retries for as long as the replay is not there. A call that is dropped has stored any number of them.

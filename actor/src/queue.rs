@@ -16,7 +16,8 @@ pub(crate) fn queue(capacity: usize, metrics: ActorMetrics) -> (QueueInput, Queu
     let (sender, receiver) = mpsc::unbounded_channel();
     let room = Arc::new(Semaphore::new(capacity));
     let input = QueueInput { sender, room: room.clone(), capacity, metrics: metrics.clone() };
-    (input, QueueOutput { receiver, room, metrics })
+    let acknowledgements = Acknowledgements { room, metrics };
+    (input, QueueOutput { receiver, acknowledgements, capacity })
 }
 
 /// Where lanes put segments.
@@ -55,11 +56,11 @@ impl QueueInput {
     }
 }
 
-/// Where the writer takes them.
+/// Where those who write take them.
 pub(crate) struct QueueOutput {
     receiver: mpsc::UnboundedReceiver<Segment>,
-    room: Arc<Semaphore>,
-    metrics: ActorMetrics,
+    acknowledgements: Acknowledgements,
+    capacity: usize,
 }
 
 impl QueueOutput {
@@ -70,6 +71,25 @@ impl QueueOutput {
         segments
     }
 
+    /// Where those who append them say so.
+    pub(crate) fn acknowledgements(&self) -> Acknowledgements {
+        self.acknowledgements.clone()
+    }
+
+    /// Segments that may be unacknowledged.
+    pub(crate) fn capacity(&self) -> usize {
+        self.capacity
+    }
+}
+
+/// Makes room for segments that a replay has.
+#[derive(Clone)]
+pub(crate) struct Acknowledgements {
+    room: Arc<Semaphore>,
+    metrics: ActorMetrics,
+}
+
+impl Acknowledgements {
     /// Makes room for as many: the replay has them.
     pub(crate) fn acknowledge(&self, segments: usize) {
         self.room.add_permits(segments);
@@ -115,7 +135,7 @@ mod tests {
         input.fill_from(&mut pending);
         assert_eq!((pending.len(), metrics.unacknowledged_segments.get()), (2, 3));
 
-        output.acknowledge(3);
+        output.acknowledgements().acknowledge(3);
         input.room().await;
         input.fill_from(&mut pending);
         assert!(pending.is_empty());

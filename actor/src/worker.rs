@@ -23,7 +23,8 @@ use crate::lanes::{GroupError, LaneSettings};
 use crate::link::{LearnerLink, LinkError, PolicyUpdate, SegmentWriter};
 use crate::metrics::ActorMetrics;
 use crate::office::Office;
-use crate::queue::{QueueInput, QueueOutput, queue};
+use crate::queue::{QueueInput, queue};
+use crate::spread::spread;
 
 /// Everything that an actor is made from.
 #[derive(Clone, Debug)]
@@ -65,7 +66,8 @@ pub enum ActorError {
     Panicked(#[from] JoinError),
 }
 
-/// Runs an actor until `shutdown`, which then takes up to `drain_seconds`.
+/// Runs an actor until `shutdown`, which then takes up to `drain_seconds`. Its segments are spread over `writers`, each
+/// the way to one replay.
 ///
 /// It waits for its first policy, and goes on waiting after the last: an actor ends by shutdown alone.
 ///
@@ -73,15 +75,16 @@ pub enum ActorError {
 /// [`ActorError`] when it cannot go on; everything it started has ended then.
 ///
 /// # Panics
-/// When `registry` has an actor's metrics already.
+/// When `registry` has an actor's metrics already, or there are no writers.
 pub async fn run<W: SegmentWriter, L: LearnerLink>(
     setup: ActorSetup,
-    writer: W,
+    writers: Vec<W>,
     link: L,
     waits: Waits,
     shutdown: Shutdown,
     registry: &Registry,
 ) -> Result<(), ActorError> {
+    assert!(!writers.is_empty(), "an actor writes somewhere");
     setup.config.validate()?;
     let metrics = ActorMetrics::new(registry);
     let stop = StopOnDrop(Shutdown::new());
@@ -100,7 +103,7 @@ pub async fn run<W: SegmentWriter, L: LearnerLink>(
     let threads = Threads { waits: &waits, stop: &stop.0, updates: &updates, queue: input };
     let mut threads = threads.start(&setup, control_limit, desk, &metrics)?;
     let mut writing = JoinSet::new();
-    writing.spawn(write(writer, output));
+    spread(writers, output, &mut writing);
     let office = Office::new(&setup.identity.name, &link, updates, waits, metrics.clone());
 
     let result = tokio::select! {
@@ -116,6 +119,8 @@ pub async fn run<W: SegmentWriter, L: LearnerLink>(
     if result.is_ok() {
         drain(&mut writing, &setup.config, &metrics).await?;
     }
+    let (segments, acknowledged) = (metrics.segments.get(), metrics.segments_acknowledged.get());
+    tracing::info!(env_steps = metrics.env_steps.get(), segments, acknowledged, "actor ended");
     result
 }
 
@@ -199,25 +204,7 @@ async fn subscribe(link: &impl LearnerLink, slot: crate::link::PolicySlot) -> Re
     pending().await
 }
 
-/// Numbers the segments and appends them, all that are there at a time.
-async fn write(mut writer: impl SegmentWriter, mut queue: QueueOutput) -> Result<(), ActorError> {
-    let mut sequence = 0;
-    loop {
-        let mut segments = queue.take().await;
-        let count = segments.len();
-        if count == 0 {
-            return Ok(());
-        }
-        for segment in &mut segments {
-            sequence += 1;
-            segment.sequence = sequence;
-        }
-        writer.append(segments).await.map_err(ActorError::Refused)?;
-        queue.acknowledge(count);
-    }
-}
-
-/// Gives the writer its time to send what the lanes left.
+/// Gives the writers their time to send what the lanes left.
 async fn drain(
     writing: &mut JoinSet<Result<(), ActorError>>,
     config: &ActorConfig,

@@ -21,7 +21,7 @@ use crate::statistics::RunningStatistics;
 
 const FORMAT: &str = "getup-checkpoint";
 /// The version of the file's format that this program writes, and the newest it reads.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// Why a checkpoint cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -78,10 +78,8 @@ pub enum CheckpointError {
 pub struct Progress {
     /// Env steps of the run.
     pub env_steps: u64,
-    /// The replay store they were counted in, and its count then.
-    pub store: u64,
-    /// See `store`.
-    pub store_env_steps: u64,
+    /// What of them was counted in which replay store, by the store's name.
+    pub stores: BTreeMap<u64, u64>,
     /// Env steps at which the next evaluation is due.
     pub next_evaluation: u64,
     /// Whether one was offered and is not reported: a resumed learner offers it again.
@@ -266,7 +264,7 @@ impl Checkpoint {
         let file = SafeTensors::deserialize(bytes).map_err(|error| damaged(error.to_string()))?;
         let header = metadata.metadata().as_ref().and_then(|map| map.get("getup"));
         let header = header.ok_or_else(|| damaged("its metadata has no key \"getup\"".into()))?;
-        let header: serde_json::Value =
+        let mut header: serde_json::Value =
             serde_json::from_str(header).map_err(|error| damaged(error.to_string()))?;
         if header["format"] != FORMAT {
             return Err(damaged(format!("its format is {}, not {FORMAT:?}", header["format"])));
@@ -276,6 +274,7 @@ impl Checkpoint {
             Some(found) => return Err(CheckpointError::Version { path: path.to_owned(), found }),
             None => return Err(damaged("it names no version".into())),
         }
+        bring_up_to_date(&mut header["progress"]);
         let header: Header = serde_json::from_value(header).map_err(|error| damaged(error.to_string()))?;
         let mut tensors = BTreeMap::new();
         for name in ["actor", "critics"].iter().flat_map(|network| {
@@ -286,6 +285,14 @@ impl Checkpoint {
         tensors.insert("targets".into(), read_buffer(&file, "targets").map_err(damaged)?);
         let Header { scalars, curriculum, progress, .. } = header;
         Ok(Self { tensors, scalars, curriculum, progress })
+    }
+}
+
+/// Version 1 knew one store.
+fn bring_up_to_date(progress: &mut serde_json::Value) {
+    let Some(fields) = progress.as_object_mut() else { return };
+    if let (Some(store), Some(env_steps)) = (fields.remove("store"), fields.remove("store_env_steps")) {
+        fields.insert("stores".into(), serde_json::json!({ store.to_string(): env_steps }));
     }
 }
 
@@ -345,6 +352,16 @@ mod tests {
     }
 
     #[test]
+    fn the_progress_of_version_1_is_read() {
+        let mut progress = serde_json::json!({
+            "env_steps": 1300, "store": 7, "store_env_steps": 1200, "next_evaluation": 20_000, "evaluation_owed": false
+        });
+        bring_up_to_date(&mut progress);
+        let progress: Progress = serde_json::from_value(progress).unwrap();
+        assert_eq!((progress.env_steps, progress.stores), (1300, [(7, 1200)].into()));
+    }
+
+    #[test]
     fn a_resumed_learner_is_bit_identical_given_the_same_minibatches() {
         let folder = tempfile::tempdir().unwrap();
         let shape = TaskShape { observation: 11, action: 4, unnormalized: vec![10] };
@@ -352,8 +369,7 @@ mod tests {
         let curriculum = Curriculum::new(CurriculumConfig::default());
         let progress = Progress {
             env_steps: 1234,
-            store: 7,
-            store_env_steps: 1200,
+            stores: [(7, 1200), (9, 34)].into(),
             next_evaluation: 20_000,
             evaluation_owed: true,
         };

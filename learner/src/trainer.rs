@@ -357,14 +357,12 @@ fn already_past(config: &TrainerConfig, progress: &Progress) -> Option<Ending> {
 }
 
 impl Progress {
-    /// Takes the replay's counters: env steps of the run go on through a resumed checkpoint and through a new
-    /// store.
+    /// Takes a replay's counters: env steps of the run go on through a resumed checkpoint and through a new store, and
+    /// several replays add up.
     fn count(&mut self, counters: &ReplayCounters) {
-        if counters.store != self.store {
-            (self.store, self.store_env_steps) = (counters.store, 0);
-        }
-        self.env_steps += counters.env_steps.saturating_sub(self.store_env_steps);
-        self.store_env_steps = self.store_env_steps.max(counters.env_steps);
+        let seen = self.stores.entry(counters.store).or_default();
+        self.env_steps += counters.env_steps.saturating_sub(*seen);
+        *seen = counters.env_steps.max(*seen);
     }
 }
 

@@ -20,7 +20,7 @@
 //! | `gate` | the limiter with its doors: who waits there, and for whom |
 //! | `tables` | [`Tables`]: stores by name, behind one address |
 //! | `service` | [`serve`]: the streams of writers and samplers |
-//! | `source`, `remote` | [`MinibatchSource`], in process and over gRPC; [`describe`] |
+//! | `source`, `remote`, `shards` | [`MinibatchSource`], in process, over gRPC, and from several services; [`describe`] |
 //! | `export` | a store's transitions for other tools |
 //! | `minibatch`, `config`, `error`, `metrics` | [`Minibatch`], [`ReplayConfig`], [`StoreError`], [`ReplayMetrics`] |
 
@@ -38,6 +38,7 @@ mod ring;
 mod sampler;
 mod selector;
 mod service;
+mod shards;
 mod source;
 mod store;
 mod sum_tree;
@@ -59,6 +60,7 @@ pub use remote::{RemoteOptions, RemoteSource, describe, describe_table, take_sna
 pub use sampler::Sampler;
 pub use selector::ItemSelector;
 pub use service::{ServeError, serve};
+pub use shards::ShardedSource;
 pub use source::{LocalSource, MinibatchSource, SampleError};
 pub use store::Store;
 pub use tables::{DEFAULT_TABLE, TableError, Tables, check_table_name};

@@ -28,6 +28,8 @@ pub struct ReplayCounters {
     pub episodes: u64,
     /// Transitions handed out in minibatches.
     pub sampled: u64,
+    /// Transitions that can be sampled now.
+    pub held: u64,
 }
 
 /// `batch` transitions, as contiguous columns.
@@ -162,14 +164,14 @@ impl MinibatchColumn {
 
 impl From<v1::ReplayCounters> for ReplayCounters {
     fn from(wire: v1::ReplayCounters) -> Self {
-        let v1::ReplayCounters { store, env_steps, transitions, episodes, sampled } = wire;
-        Self { store, env_steps, transitions, episodes, sampled }
+        let v1::ReplayCounters { store, env_steps, transitions, episodes, sampled, held } = wire;
+        Self { store, env_steps, transitions, episodes, sampled, held }
     }
 }
 
 impl From<ReplayCounters> for v1::ReplayCounters {
     fn from(counters: ReplayCounters) -> Self {
-        let ReplayCounters { store, env_steps, transitions, episodes, sampled } = counters;
-        Self { store, env_steps, transitions, episodes, sampled }
+        let ReplayCounters { store, env_steps, transitions, episodes, sampled, held } = counters;
+        Self { store, env_steps, transitions, episodes, sampled, held }
     }
 }

@@ -7,7 +7,7 @@ use getup_proto::v1::replay_client::ReplayClient;
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, v1};
 use getup_telemetry::{Backoff, Shutdown, Waits};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
@@ -18,7 +18,7 @@ use tonic::{Code, Status};
 /// How often a wait looks whether it was cancelled.
 const CANCEL_TICK: Duration = Duration::from_millis(50);
 /// How often a wait's reason is brought up to date.
-const REASON_TICK: Duration = Duration::from_secs(1);
+pub(crate) const REASON_TICK: Duration = Duration::from_secs(1);
 /// How long a connection or a short call may take.
 const CALL_PATIENCE: Duration = Duration::from_secs(5);
 /// A service that does not answer pings for this long is gone.
@@ -71,9 +71,38 @@ pub struct RemoteOptions {
 /// A reason that the task writes and the one who waits reads.
 type Reason = Arc<Mutex<String>>;
 
+/// Rings when something has come, for one who waits for several.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Bell(Arc<(Mutex<bool>, Condvar)>);
+
+impl Bell {
+    fn ring(&self) {
+        *self.0.0.lock().unwrap_or_else(PoisonError::into_inner) = true;
+        self.0.1.notify_one();
+    }
+
+    /// Returns when it has rung since the last wait, or `patience` is over; whether it has.
+    pub(crate) fn wait(&self, patience: Duration) -> bool {
+        let rung = self.0.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let waited = self.0.1.wait_timeout_while(rung, patience, |rung| !*rung);
+        std::mem::take(&mut *waited.unwrap_or_else(PoisonError::into_inner).0)
+    }
+}
+
 impl RemoteSource {
     /// Starts the task on `runtime`; it ends with the source.
     pub fn new(options: RemoteOptions, runtime: &Handle, waits: Waits, shutdown: Shutdown) -> Self {
+        Self::with_bell(options, runtime, waits, shutdown, None)
+    }
+
+    /// As [`RemoteSource::new`]; the bell rings when something has come into the queue.
+    pub(crate) fn with_bell(
+        options: RemoteOptions,
+        runtime: &Handle,
+        waits: Waits,
+        shutdown: Shutdown,
+        bell: Option<Bell>,
+    ) -> Self {
         let prefetch = options.prefetch.max(1);
         // One place more, for the error that ends it.
         let (sender, queue) = sync_channel(prefetch + 1);
@@ -88,10 +117,16 @@ impl RemoteSource {
             updates,
             queued: 0,
             reason: reason.clone(),
+            bell,
             streams: 0,
         };
         runtime.spawn(fetching.run());
         Self { queue, taken, priorities, gathered: Vec::new(), reason, waits, wait: None, shutdown }
+    }
+
+    /// Why there is no minibatch.
+    pub(crate) fn reason(&self) -> String {
+        lock(&self.reason).clone()
     }
 }
 
@@ -118,11 +153,10 @@ impl MinibatchSource for RemoteSource {
                 Err(RecvTimeoutError::Timeout) if left.is_zero() => return Ok(None),
                 Err(RecvTimeoutError::Timeout) => {}
             }
-            let reason = || lock(&self.reason).clone();
             match &mut self.wait {
-                None => self.wait = Some((self.waits.begin("learner", reason()), Instant::now())),
+                None => self.wait = Some((self.waits.begin("learner", self.reason()), Instant::now())),
                 Some((guard, explained)) if explained.elapsed() >= REASON_TICK => {
-                    guard.set_reason(reason());
+                    guard.set_reason(lock(&self.reason).clone());
                     *explained = Instant::now();
                 }
                 Some(_) => {}
@@ -218,6 +252,7 @@ struct Fetching {
     /// Minibatches in the queue.
     queued: usize,
     reason: Reason,
+    bell: Option<Bell>,
     /// Streams opened so far.
     streams: u64,
 }
@@ -248,6 +283,7 @@ impl Fetching {
                     let endpoint = self.options.endpoint.clone();
                     // There is a place for it; a source that was dropped needs it no more.
                     let _ = self.queue.try_send(Err(SampleError::Refused { endpoint, reason }));
+                    self.ring();
                     return;
                 }
             }
@@ -362,7 +398,14 @@ impl Fetching {
             }
             self.queued += 1;
         }
+        self.ring();
         Ok(())
+    }
+
+    fn ring(&self) {
+        if let Some(bell) = &self.bell {
+            bell.ring();
+        }
     }
 
     /// Counts what was taken while there was no stream; true if nobody will take any more.

@@ -270,11 +270,11 @@ impl Store {
         let writing = self.writing();
         let started = Instant::now();
         let snapshot = writing.log.begin_snapshot(to);
-        let state = writing.log.state();
+        let (state, held) = (writing.log.state(), self.len());
         drop(writing);
         let paused = started.elapsed();
         let snapshot = snapshot?;
-        let counters = self.counters_of(state, snapshot.sampled());
+        let counters = self.counters_of(state, snapshot.sampled(), held);
         snapshot.finish(&self.spec)?;
         Ok((paused, counters))
     }
@@ -329,7 +329,7 @@ impl Store {
             sampled = total;
             self.watermark.set_sampled(total)
         };
-        let (columns, items, state) = if self.selects {
+        let (columns, items, state, held) = if self.selects {
             let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
             if !self.gate.try_sample(options.batch as u64, count)? {
                 return Ok(None);
@@ -339,16 +339,18 @@ impl Store {
             let ring = &memory.ring;
             let item =
                 |drawn: &Drawn| Item { key: ring.key(drawn.row), probability: drawn.probability as f32 };
-            (gather(ring, &drawn, options), drawn.iter().map(item).collect(), memory.state)
+            let items = drawn.iter().map(item).collect();
+            (gather(ring, &drawn, options), items, memory.state, ring.len())
         } else {
             if !self.gate.try_sample(options.batch as u64, count)? {
                 return Ok(None);
             }
             let memory = self.memory();
             let drawn = sampler.draw_uniformly(&memory.ring, options.batch);
-            (gather(&memory.ring, &drawn, options), Vec::new(), memory.state)
+            let columns = gather(&memory.ring, &drawn, options);
+            (columns, Vec::new(), memory.state, memory.ring.len())
         };
-        let counters = self.counters_of(state, sampled);
+        let counters = self.counters_of(state, sampled, held);
         self.metrics.sampled.inc_by(options.batch as u64);
         self.metrics.sample_seconds.observe(started.elapsed().as_secs_f64());
         self.show_limiter();
@@ -373,7 +375,11 @@ impl Store {
 
     /// Totals over the store's life.
     pub fn counters(&self) -> ReplayCounters {
-        self.counters_of(self.memory().state, self.gate.limiter().samples())
+        let (state, held) = {
+            let memory = self.memory();
+            (memory.state, memory.ring.len())
+        };
+        self.counters_of(state, self.gate.limiter().samples(), held)
     }
 
     /// Transitions that can be sampled now.
@@ -426,9 +432,9 @@ impl Store {
         &self.metrics
     }
 
-    fn counters_of(&self, state: State, sampled: u64) -> ReplayCounters {
+    fn counters_of(&self, state: State, sampled: u64, held: usize) -> ReplayCounters {
         let State { env_steps, transitions, episodes, .. } = state;
-        ReplayCounters { store: self.id, env_steps, transitions, episodes, sampled }
+        ReplayCounters { store: self.id, env_steps, transitions, episodes, sampled, held: held as u64 }
     }
 
     fn show_limiter(&self) {

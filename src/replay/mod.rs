@@ -6,10 +6,10 @@ mod tools;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use anyhow::Result;
+use anyhow::{Context, Result, bail};
 use getup_replay::{ReplayMetrics, Store, Tables, serve};
 
-use crate::config::Config;
+use crate::config::{Config, NetworkConfig};
 use crate::role::{Role, RoleArgs, bind};
 
 /// Run the replay: stores what actors push, durably, and serves minibatches to the learner.
@@ -22,7 +22,10 @@ pub(crate) struct Args {
     tool: Option<tools::Tool>,
     #[command(flatten)]
     role: RoleArgs,
-    /// The store's folder. [default: `replay` in the run's folder]
+    /// Which of the addresses in network.replay is this one's, from 0; needed where there are several.
+    #[arg(long, value_name = "N")]
+    shard: Option<usize>,
+    /// The store's folder. [default: `replay` in the run's folder; of several replays `replay-N`]
     #[arg(long, value_name = "DIR")]
     dir: Option<PathBuf>,
     /// A TOML file of further tables, a section each: `[NAME]` with capacity, min_size, samples_per_insert,
@@ -38,15 +41,53 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     }
     let config = arguments.role.config.load()?;
     let role = Role::new("replay", arguments.role.log_format)?;
-    let dir = arguments.dir.unwrap_or_else(|| PathBuf::from("runs").join(&config.run).join("replay"));
-    role.run(start(&config, &role, dir, arguments.tables))
+    let shard = Shard::choose(&config.network, arguments.shard)?;
+    let dir = arguments.dir.unwrap_or_else(|| PathBuf::from("runs").join(&config.run).join(shard.folder()));
+    role.run(start(&config, &role, &shard, dir, arguments.tables))
 }
 
-async fn start(config: &Config, role: &Role, dir: PathBuf, tables: Option<PathBuf>) -> Result<()> {
-    let listener = bind(&config.network.replay, "gRPC").await?;
+/// Which of the run's replays this one is.
+struct Shard {
+    address: String,
+    index: usize,
+    of: usize,
+}
+
+impl Shard {
+    fn choose(network: &NetworkConfig, index: Option<usize>) -> Result<Self> {
+        let replays = network.replays();
+        let of = replays.len();
+        let asked = match index {
+            None if of > 1 => bail!(
+                "network.replay names {of} replays ({}): say which one this is by --shard 0 to {}",
+                network.replay,
+                of - 1
+            ),
+            asked => asked.unwrap_or(0),
+        };
+        let address = replays.into_iter().nth(asked);
+        let address = address.with_context(|| {
+            format!("--shard {asked}: network.replay ({}) names {of}, and they count from 0", network.replay)
+        })?;
+        Ok(Self { address, index: asked, of })
+    }
+
+    fn folder(&self) -> String {
+        if self.of == 1 { "replay".into() } else { format!("replay-{}", self.index) }
+    }
+}
+
+async fn start(
+    config: &Config,
+    role: &Role,
+    shard: &Shard,
+    dir: PathBuf,
+    tables: Option<PathBuf>,
+) -> Result<()> {
+    let listener = bind(&shard.address, "gRPC").await?;
     role.serve_metrics(&config.network.replay_metrics).await?;
     std::fs::create_dir_all(&dir)?;
-    let (spec, settings) = (config.run_spec()?, config.replay_config());
+    let (spec, settings) = (config.run_spec()?, config.replay_config(shard.of));
     let metrics = ReplayMetrics::new(&role.registry);
     tracing::info!("replay will serve gRPC at {}, its store is {}", listener.local_addr()?, dir.display());
     let (role_here, folder) = (role.clone(), dir.clone());

@@ -249,8 +249,14 @@ fn dataset(output: Option<PathBuf>, id: Option<String>, run: &str) -> Result<(Pa
 
 #[tokio::main(flavor = "current_thread")]
 async fn snapshot(name: &str, table: &str, config: &ConfigArgs, json: bool) -> Result<()> {
-    let address = config.load()?.network.replay;
-    let taken = getup_replay::take_snapshot(&address, table, name).await;
+    for address in config.load()?.network.replays() {
+        snapshot_of(&address, name, table, json).await?;
+    }
+    Ok(())
+}
+
+async fn snapshot_of(address: &str, name: &str, table: &str, json: bool) -> Result<()> {
+    let taken = getup_replay::take_snapshot(address, table, name).await;
     let taken = taken.map_err(|status| anyhow::anyhow!("replay at {address}: {}", status.message()))?;
     let transitions = taken.counters.unwrap_or_default().transitions;
     if json {

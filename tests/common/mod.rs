@@ -96,6 +96,64 @@ impl Drop for Process {
     }
 }
 
+/// Addresses and folder of one cluster, of preset smoke.
+pub(crate) struct Cluster {
+    folder: tempfile::TempDir,
+    addresses: [(&'static str, String); 5],
+}
+
+impl Cluster {
+    /// Free addresses, and an empty folder.
+    pub(crate) fn new() -> Self {
+        Self::with_replay(free_address())
+    }
+
+    /// With the replays at these addresses.
+    pub(crate) fn with_replay(replay: String) -> Self {
+        let names = ["replay", "learner", "replay_metrics", "learner_metrics", "actor_metrics"];
+        let address = |name| if name == "replay" { replay.clone() } else { free_address() };
+        Self { folder: tempfile::tempdir().unwrap(), addresses: names.map(|name| (name, address(name))) }
+    }
+
+    /// One of the addresses.
+    pub(crate) fn address(&self, name: &str) -> &str {
+        &self.addresses.iter().find(|(known, _)| *known == name).unwrap().1
+    }
+
+    /// Where all its processes run.
+    pub(crate) fn path(&self) -> &Path {
+        self.folder.path()
+    }
+
+    /// A command of this cluster: preset, addresses, a curriculum that a limp body passes.
+    pub(crate) fn command(&self, role: &str, omega: f64) -> Command {
+        let mut command = getup(&[role, "--preset", "smoke", "--set", "run=smoke"]);
+        command.args(["--set", &format!("curriculum.omega={omega}")]);
+        for (name, address) in &self.addresses {
+            command.args(["--set", &format!("network.{name}={address}")]);
+        }
+        command.current_dir(self.path());
+        command
+    }
+
+    /// Starts a role; it joins the others, whoever came first.
+
+    pub(crate) fn start(&self, role: &'static str, omega: f64) -> Process {
+        Process::start(role, self.path(), self.command(role, omega).args(["--log-format", "json"]))
+    }
+
+    /// A metric of the learner, by its name without the prefix.
+    pub(crate) fn learner_metric(&self, name: &str) -> Option<f64> {
+        metric(self.address("learner_metrics"), &format!("getup_learner_{name}"))
+    }
+
+    /// What `getup status --json` says.
+    pub(crate) fn status(&self) -> Option<serde_json::Value> {
+        let output = self.command("status", 1.0).arg("--json").output().unwrap();
+        serde_json::from_slice(&output.stdout).ok()
+    }
+}
+
 /// An address on loopback that nobody listens at now.
 pub(crate) fn free_address() -> String {
     TcpListener::bind("127.0.0.1:0").expect("a free port").local_addr().expect("it is bound").to_string()

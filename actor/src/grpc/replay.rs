@@ -97,6 +97,10 @@ fn request(message: Message) -> AppendRequest {
 }
 
 impl SegmentWriter for GrpcReplay {
+    fn writer(&self) -> u64 {
+        self.identity.writer
+    }
+
     async fn append(&mut self, segments: Vec<Segment>) -> Result<(), LinkError> {
         let mut waiting: Option<WaitGuard> = None;
         loop {

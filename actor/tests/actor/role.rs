@@ -29,7 +29,8 @@ impl Actor {
         let link =
             GrpcLearner::new(learner, setup.spec.clone(), &setup.identity.name, waits.clone()).unwrap();
         let (ended, seen, metrics) = (shutdown.clone(), waits.clone(), registry.clone());
-        let running = tokio::spawn(async move { run(setup, writer, link, seen, ended, &metrics).await });
+        let running =
+            tokio::spawn(async move { run(setup, vec![writer], link, seen, ended, &metrics).await });
         Self { shutdown, registry, waits, running }
     }
 

@@ -1,0 +1,160 @@
+//! Spreads segments over several replays.
+//!
+//! An episode's segments stay together, so that n-step returns join them, for as long as their replay takes them. Each
+//! replay may have its share of the queue unacknowledged, and no more: one that is away keeps what it may have stored,
+//! which nobody else must store again, and all else goes to the others.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use getup_proto::Segment;
+use tokio::sync::{Notify, mpsc};
+use tokio::task::JoinSet;
+
+use crate::link::SegmentWriter;
+use crate::queue::{Acknowledgements, QueueOutput};
+use crate::worker::ActorError;
+
+/// Takes segments from `queue` until its inputs are gone, and appends each by one of `writers`; tasks of `tasks` do it.
+pub(crate) fn spread<W: SegmentWriter>(
+    writers: Vec<W>,
+    queue: QueueOutput,
+    tasks: &mut JoinSet<Result<(), ActorError>>,
+) {
+    let freed = Arc::new(Notify::new());
+    let shares = Shares::new(queue.capacity().div_ceil(writers.len()));
+    let mut desks = Vec::new();
+    for link in writers {
+        let (segments, inbox) = mpsc::unbounded_channel();
+        let unacknowledged = Arc::new(AtomicUsize::new(0));
+        desks.push(Desk { segments, unacknowledged: unacknowledged.clone() });
+        tasks.spawn(append(Appending {
+            link,
+            inbox,
+            unacknowledged,
+            freed: freed.clone(),
+            acknowledgements: queue.acknowledgements(),
+        }));
+    }
+    tasks.spawn(distribute(queue, shares, desks, freed));
+}
+
+/// A replay, as the one who distributes sees it.
+struct Desk {
+    segments: mpsc::UnboundedSender<Segment>,
+    unacknowledged: Arc<AtomicUsize>,
+}
+
+async fn distribute(
+    mut queue: QueueOutput,
+    mut shares: Shares,
+    desks: Vec<Desk>,
+    freed: Arc<Notify>,
+) -> Result<(), ActorError> {
+    loop {
+        let segments = queue.take().await;
+        if segments.is_empty() {
+            return Ok(());
+        }
+        for segment in segments {
+            let desk = loop {
+                let load = |desk: &Desk| desk.unacknowledged.load(Ordering::Acquire);
+                let loads: Vec<usize> = desks.iter().map(load).collect();
+                match shares.choose(segment.lane, segment.episode, &loads) {
+                    Some(index) => break &desks[index],
+                    None => freed.notified().await,
+                }
+            };
+            desk.unacknowledged.fetch_add(1, Ordering::AcqRel);
+            // One that has ended has failed, and with it the actor.
+            let _ = desk.segments.send(segment);
+        }
+    }
+}
+
+/// What appends to one replay.
+struct Appending<W> {
+    link: W,
+    inbox: mpsc::UnboundedReceiver<Segment>,
+    unacknowledged: Arc<AtomicUsize>,
+    freed: Arc<Notify>,
+    acknowledgements: Acknowledgements,
+}
+
+/// Numbers the segments and appends them, all that are there at a time.
+async fn append<W: SegmentWriter>(mut to: Appending<W>) -> Result<(), ActorError> {
+    let mut sequence = 0;
+    loop {
+        let mut segments = Vec::new();
+        let count = to.inbox.recv_many(&mut segments, usize::MAX).await;
+        if count == 0 {
+            return Ok(());
+        }
+        for segment in &mut segments {
+            sequence += 1;
+            (segment.writer, segment.sequence) = (to.link.writer(), sequence);
+        }
+        to.link.append(segments).await.map_err(ActorError::Refused)?;
+        to.unacknowledged.fetch_sub(count, Ordering::AcqRel);
+        to.freed.notify_one();
+        to.acknowledgements.acknowledge(count);
+    }
+}
+
+/// Who gets the next segment.
+#[derive(Debug)]
+struct Shares {
+    /// Segments of a replay that may be unacknowledged.
+    share: usize,
+    /// The episode of each lane, and where its segments go.
+    lanes: HashMap<u32, (u64, usize)>,
+}
+
+impl Shares {
+    fn new(share: usize) -> Self {
+        Self { share, lanes: HashMap::new() }
+    }
+
+    /// The replay for a segment, given how many of each are unacknowledged: that of its episode, or where that has its
+    /// share, or for a new episode, the one with the fewest. None where all have their share.
+    fn choose(&mut self, lane: u32, episode: u64, unacknowledged: &[usize]) -> Option<usize> {
+        let has_room = |index: usize| unacknowledged[index] < self.share;
+        let same = self.lanes.get(&lane).filter(|&&(of, index)| of == episode && has_room(index));
+        let fewest = || (0..unacknowledged.len()).min_by_key(|&index| unacknowledged[index]);
+        let chosen = same.map(|&(_, index)| index).or_else(fewest).filter(|&index| has_room(index))?;
+        self.lanes.insert(lane, (episode, chosen));
+        Some(chosen)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_episode_stays_where_it_began() {
+        let mut shares = Shares::new(4);
+        assert_eq!(shares.choose(0, 1, &[0, 0]), Some(0));
+        assert_eq!(shares.choose(1, 1, &[1, 0]), Some(1));
+        assert_eq!(shares.choose(0, 1, &[3, 0]), Some(0), "though the other has fewer");
+        assert_eq!(shares.choose(0, 2, &[3, 0]), Some(1), "the next episode is free to go");
+    }
+
+    #[test]
+    fn one_that_is_away_gets_its_share_and_no_more() {
+        let mut shares = Shares::new(2);
+        let mut unacknowledged = [0, 0];
+        let mut given = [0, 0];
+        for step in 0..40 {
+            let lane = step % 5;
+            let index =
+                shares.choose(lane, u64::from(step / 20), &unacknowledged).expect("the other takes all");
+            given[index] += 1;
+            // The second acknowledges at once, the first never.
+            unacknowledged[0] += usize::from(index == 0);
+        }
+        assert_eq!(given, [2, 38]);
+        assert_eq!(shares.choose(0, 9, &[2, 2]), None);
+    }
+}
