@@ -145,7 +145,7 @@ impl Actor {
     fn new(case: &Case, task: &Arc<dyn Task>) -> anyhow::Result<Self> {
         let folder = tempfile::tempdir()?;
         let registry = Registry::new();
-        let (metrics, spec) = (ActorMetrics::new(&registry), run_spec(&**task));
+        let (metrics, spec) = (ActorMetrics::new(&registry, "bench"), run_spec(&**task));
         // Without samples_per_insert nobody waits.
         let (config, waits) = (ReplayConfig::default(), Waits::new(&registry));
         let store = Store::open(folder.path(), &spec, &config, ReplayMetrics::new(&registry), waits)?;

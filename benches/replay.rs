@@ -333,7 +333,7 @@ async fn write(endpoint: String, writer: u64, at_once: usize) -> Result<(usize, 
         Identity { name: format!("writer {writer}"), run_seed: 0, writer: writer + 1000 * at_once as u64 };
     let id = identity.writer;
     let waits = Waits::new(&Registry::new());
-    let mut link = GrpcReplay::new(&format!("http://{endpoint}"), fixtures::get_up_spec(), identity, waits)?;
+    let mut link = GrpcReplay::new(&endpoint, fixtures::get_up_spec(), identity, waits)?;
     let (mut transitions, mut times, mut sequence) = (0, Vec::new(), 0);
     let started = Instant::now();
     'turn: loop {

@@ -8,9 +8,11 @@ use getup_actor::grpc::{GrpcLearner, GrpcReplay};
 use getup_actor::identity::Identity;
 use getup_actor::worker::{self, ActorSetup};
 use getup_telemetry::health;
+use getup_transport::{Endpoint, Limits};
+use tonic::service::Routes;
 
 use crate::config::Config;
-use crate::role::{Role, RoleArgs, bind, grpc_server, host_name, serve_grpc};
+use crate::role::{Role, RoleArgs, host_name, serve_grpc};
 
 /// Run an actor: simulates episodes under the newest policy, pushes them to the replay, plays leased evaluations.
 ///
@@ -36,7 +38,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         config.actor.name = format!("{}-{}", host_name(), std::process::id());
     }
     config.validate()?;
-    let role = Role::new("actor", arguments.role.log_format)?;
+    let role = Role::new("actor", &config, arguments.role.log_format)?;
     role.run(serve(&config, &role, arguments.diverged))
 }
 
@@ -45,26 +47,24 @@ async fn serve(config: &Config, role: &Role, diverged: PathBuf) -> Result<()> {
     let setup = setup(config, identity.clone(), diverged)?;
     let network = &config.network;
     let waits = &role.waits;
+    let at = |address: &str| Endpoint::new(address, &role.credentials);
     let writer = |(index, address): (usize, &String)| {
-        GrpcReplay::new(&url(address), setup.spec.clone(), identity.towards(index), waits.clone())
+        GrpcReplay::new(at(address), setup.spec.clone(), identity.towards(index), waits.clone())
     };
     let writers = network.replays().iter().enumerate().map(writer).collect::<Result<Vec<_>, _>>()?;
-    let link =
-        GrpcLearner::new(&url(&network.learner), setup.spec.clone(), &config.actor.name, waits.clone())?;
+    let link = GrpcLearner::new(at(&network.learner), setup.spec.clone(), &config.actor.name, waits.clone())?;
     role.serve_metrics(&network.actor_metrics).await?;
-    let listener = bind(&network.actor, "gRPC health").await?;
+    let listener = role.bind_grpc(&network.actor).await?;
     tracing::info!(name = config.actor.name, health = %listener.local_addr()?, "actor started");
     let (_reporter, health) = health();
-    let server = tokio::spawn(serve_grpc(grpc_server().add_service(health), listener, role.shutdown.clone()));
+    let (port, routes) = (role.port(Limits::default()), Routes::new(health));
+    let server = tokio::spawn(serve_grpc(port, routes, listener, role.shutdown.clone()));
+    role.ready.set();
     let result =
         worker::run(setup, writers, link, waits.clone(), role.shutdown.clone(), &role.registry).await;
     role.shutdown.trigger();
     server.await??;
     Ok(result?)
-}
-
-fn url(address: &str) -> String {
-    format!("http://{address}")
 }
 
 /// Everything that an actor of this run is made from.

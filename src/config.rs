@@ -12,6 +12,7 @@ use getup_learner::config::{CurriculumConfig, EvaluationConfig, LearnerConfig, S
 use getup_proto::{ColumnSpec, Rows, RunSpec, columns};
 use getup_replay::{ItemSelector, ReplayConfig, SyncMode};
 use getup_sim::{GetUp, Task, TaskConfig};
+use getup_transport::SecurityConfig;
 use serde::{Deserialize, Serialize};
 
 pub(crate) use layers::Layers;
@@ -41,6 +42,7 @@ pub(crate) struct Config {
     pub(crate) evaluation: EvaluationConfig,
     pub(crate) learner: LearnerConfig,
     pub(crate) network: NetworkConfig,
+    pub(crate) security: SecurityConfig,
 }
 
 /// The replay's own settings; when it may be sampled follows from `[sac]`.
@@ -130,6 +132,7 @@ impl Default for Config {
             evaluation: EvaluationConfig::default(),
             learner: LearnerConfig::default(),
             network: NetworkConfig::default(),
+            security: SecurityConfig::default(),
         }
     }
 }
@@ -198,6 +201,7 @@ impl Config {
             self.replay.capacity
         );
         self.network.validate()?;
+        self.security.validate()?;
         self.replay_config(self.network.replays().len()).validate_for(&self.run_spec()?)?;
         self.sac.validate()?;
         self.curriculum.validate()?;

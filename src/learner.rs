@@ -8,18 +8,21 @@ use anyhow::{Context, Result, ensure};
 use getup_learner::checkpoint::Checkpoint;
 use getup_learner::device::{self, Device};
 use getup_learner::hub::Hub;
+use getup_learner::hub_metrics::HubMetrics;
 use getup_learner::run_folder::{RunFolder, write_atomically};
 use getup_learner::sac::TaskShape;
 use getup_learner::service::service;
-use getup_learner::trainer::{Ending, Start, Trainer, TrainerConfig};
+use getup_learner::trainer::{Ending, Start, TrainError, Trainer, TrainerConfig};
 use getup_replay::{RemoteOptions, SampleOptions, ShardedSource};
 use getup_sim::{GetUp, Task};
 use getup_telemetry::health;
+use getup_transport::{Endpoint, Limits, Window};
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use tonic::service::Routes;
 
 use crate::config::Config;
-use crate::role::{Role, RoleArgs, bind, grpc_server, serve_grpc};
+use crate::role::{Role, RoleArgs, serve_grpc};
 
 /// Minibatches that are on their way while one is trained on.
 const PREFETCH: usize = 8;
@@ -42,7 +45,7 @@ pub(crate) struct Args {
 
 pub(crate) fn run(arguments: Args) -> Result<()> {
     let config = arguments.role.config.load()?;
-    let role = Role::new("learner", arguments.role.log_format)?;
+    let role = Role::new("learner", &config, arguments.role.log_format)?;
     let folder = RunFolder::new(arguments.run.unwrap_or_else(|| PathBuf::from("runs").join(&config.run)));
     let device = device::open(config.learner.device, config.learner.effective_threads())?;
     role.run(serve(&config, &role, folder, device, arguments.from.as_deref()))
@@ -63,17 +66,19 @@ async fn serve(
     folder.create()?;
     let (hub, incarnation) = make_hub(config, role, &folder)?;
     let address = &config.network.learner;
-    let listener = bind(address, "gRPC").await?;
+    let listener = role.bind_grpc(address).await?;
     tracing::info!("learner serves gRPC at {}", listener.local_addr()?);
     let mut trainer =
         make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, start)?;
     write_atomically(&folder.config(), config.to_toml()?.as_bytes())?;
     role.serve_metrics(&config.network.learner_metrics).await?;
     let (_reporter, health) = health();
-    let server = grpc_server().add_service(health).add_service(service(hub, role.shutdown.clone()));
-    let server = tokio::spawn(serve_grpc(server, listener, role.shutdown.clone()));
+    let routes = Routes::new(health).add_service(service(hub, role.shutdown.clone()));
+    let port = role.port(Limits { window: Window::Adaptive, ..Limits::default() });
+    let server = tokio::spawn(serve_grpc(port, routes, listener, role.shutdown.clone()));
+    role.ready.set();
     let options = RemoteOptions {
-        endpoint: String::new(),
+        endpoint: Endpoint::default(),
         spec: config.run_spec()?,
         sample: sample_options(config, incarnation),
         name: "learner".into(),
@@ -81,11 +86,18 @@ async fn serve(
         prefetch: PREFETCH,
     };
     let runtime = tokio::runtime::Handle::current();
-    let (replays, waits, shutdown) = (config.network.replays(), role.waits.clone(), role.shutdown.clone());
+    let at = |address: &String| Endpoint::new(address, &role.credentials);
+    let replays: Vec<Endpoint> = config.network.replays().iter().map(at).collect();
+    let (waits, shutdown) = (role.waits.clone(), role.shutdown.clone());
     let mut source = ShardedSource::new(&replays, &options, &runtime, waits, shutdown);
     let shutdown = role.shutdown.clone();
     let result = tokio::task::spawn_blocking(move || trainer.run(&mut source, &shutdown)).await?;
     match &result {
+        Err(error @ TrainError::Loss(_)) => {
+            // Actors go on by the last good policy, and whoever looks sees why training does not: until it is restarted.
+            tracing::error!("{error}");
+            role.shutdown.wait().await;
+        }
         Ok(Ending::Shutdown) | Err(_) => {}
         Ok(_) => {
             tracing::info!("finished: serving the final policy until SIGTERM");
@@ -123,7 +135,9 @@ pub(crate) fn make_hub(config: &Config, role: &Role, folder: &RunFolder) -> Resu
     let seeds = evaluation_seeds(config.seed, config.evaluation.episodes);
     let keep_alive = Duration::from_secs_f64(config.evaluation.lease_seconds);
     let hub = Hub::new(config.run_spec()?, seeds, keep_alive, incarnation, role.waits.clone());
-    Ok((Arc::new(hub), incarnation))
+    let hub = Arc::new(hub);
+    role.registry.register(Box::new(HubMetrics::new(Arc::downgrade(&hub))))?;
+    Ok((hub, incarnation))
 }
 
 /// The seeds of a run's evaluations: the same fallen states throughout.

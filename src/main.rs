@@ -4,10 +4,12 @@
 //! `getup-actor`, `getup-learner`, `getup-replay`, `getup-sim`.
 
 mod actor;
+mod certs;
 mod config;
 mod doctor;
 mod evaluate;
 mod falls;
+mod health;
 #[cfg(feature = "learner")]
 mod learner;
 #[cfg(feature = "learner")]
@@ -52,6 +54,8 @@ enum Command {
     Rollout(rollout::Args),
     Falls(falls::Args),
     Doctor(doctor::Args),
+    Certs(certs::Args),
+    Health(health::Args),
     Status(status::Args),
 }
 
@@ -69,6 +73,8 @@ fn main() -> ExitCode {
         Command::Rollout(arguments) => rollout::run(arguments),
         Command::Falls(arguments) => falls::run(arguments),
         Command::Doctor(arguments) => doctor::run(arguments),
+        Command::Certs(arguments) => certs::run(arguments),
+        Command::Health(arguments) => health::run(arguments),
         Command::Status(arguments) => status::run(arguments),
     };
     match result {

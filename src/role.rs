@@ -3,21 +3,22 @@
 use std::future::Future;
 use std::io::{self, Write};
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
-use getup_telemetry::{LogFormat, Registry, Shutdown, Waits, build_info, init_logging, serve_http};
+use getup_telemetry::{
+    LogFormat, Ready, Registry, Shown, Shutdown, Waits, build_info, init_logging, registry, serve_http,
+};
+use getup_transport::{Credentials, Limits, Metrics, SecurityConfig, Server, require_protection};
 use indicatif::MultiProgress;
 use tokio::net::TcpListener;
-use tokio_stream::wrappers::TcpListenerStream;
-use tonic::transport::server::Router;
+use tonic::service::Routes;
 
-use crate::config::ConfigArgs;
+use crate::config::{Config, ConfigArgs};
 
 /// How long the end of a process waits for what does not end by itself.
 const GRACE: Duration = Duration::from_secs(2);
-/// A peer that does not answer pings for this long is gone.
-const PING_EVERY: Duration = Duration::from_secs(10);
 
 /// What every role's command line shares.
 #[derive(clap::Args, Clone, Debug)]
@@ -35,6 +36,12 @@ pub(crate) struct Role {
     pub(crate) registry: Registry,
     pub(crate) waits: Waits,
     pub(crate) shutdown: Shutdown,
+    /// What this process shows to others, and wants to be shown.
+    pub(crate) credentials: Credentials,
+    security: SecurityConfig,
+    grpc: Metrics,
+    /// What `/healthz` says.
+    pub(crate) ready: Ready,
     /// Where progress bars go; log lines step aside for them.
     #[cfg(feature = "learner")]
     pub(crate) progress: MultiProgress,
@@ -42,16 +49,20 @@ pub(crate) struct Role {
 
 impl Role {
     /// Sets up logs and a registry for the role of this name.
-    pub(crate) fn new(name: &str, log_format: LogFormat) -> Result<Self> {
+    pub(crate) fn new(name: &str, config: &Config, log_format: LogFormat) -> Result<Self> {
         let progress = MultiProgress::new();
         let writer = progress.clone();
         init_logging(log_format, move || LogWriter(writer.clone()))?;
-        let registry = Registry::new();
+        let registry = registry(&config.run);
         build_info(&registry, name);
         Ok(Self {
             waits: Waits::new(&registry),
+            credentials: Credentials::load(&config.security)?,
+            security: config.security.clone(),
+            grpc: Metrics::new(&registry),
             registry,
             shutdown: Shutdown::new(),
+            ready: Ready::default(),
             #[cfg(feature = "learner")]
             progress,
         })
@@ -73,14 +84,32 @@ impl Role {
         result
     }
 
+    /// Binds a gRPC port, which others than this machine reach only where they show something or are meant to.
+    pub(crate) async fn bind_grpc(&self, address: &str) -> Result<TcpListener> {
+        let listener = bind(address, "gRPC").await?;
+        require_protection(listener.local_addr()?, &self.security)?;
+        Ok(listener)
+    }
+
+    /// A gRPC port that wants to be shown what the configuration says.
+    pub(crate) fn port(&self, limits: Limits) -> Server {
+        Server::new(self.credentials.clone(), limits, self.grpc.clone())
+    }
+
     /// Serves `/metrics` at `address` until shutdown; returns where.
     pub(crate) async fn serve_metrics(&self, address: &str) -> Result<SocketAddr> {
         let listener = bind(address, "metrics").await?;
         let bound = listener.local_addr()?;
         tracing::info!("metrics at http://{bound}/metrics");
-        let (registry, shutdown) = (self.registry.clone(), self.shutdown.clone());
+        let credentials = self.credentials.clone();
+        let shown = Shown {
+            registry: self.registry.clone(),
+            ready: self.ready.clone(),
+            guard: Arc::new(move |headers| credentials.may_read_metrics(headers)),
+        };
+        let shutdown = self.shutdown.clone();
         tokio::spawn(async move {
-            if let Err(error) = serve_http(listener, registry, shutdown).await {
+            if let Err(error) = serve_http(listener, shown, shutdown).await {
                 tracing::error!(%error, "/metrics is not served any more");
             }
         });
@@ -88,18 +117,15 @@ impl Role {
     }
 }
 
-/// A gRPC server that drops connections whose peers do not answer.
-pub(crate) fn grpc_server() -> tonic::transport::Server {
-    tonic::transport::Server::builder()
-        .http2_keepalive_interval(Some(PING_EVERY))
-        .http2_keepalive_timeout(Some(PING_EVERY))
-}
-
 /// Serves until shutdown, and then for as long as peers need to let go, but no longer than [`GRACE`].
-pub(crate) async fn serve_grpc(server: Router, listener: TcpListener, shutdown: Shutdown) -> Result<()> {
+pub(crate) async fn serve_grpc(
+    port: Server,
+    routes: Routes,
+    listener: TcpListener,
+    shutdown: Shutdown,
+) -> Result<()> {
     let (ended, late) = (shutdown.clone(), shutdown);
-    let serving = server
-        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move { ended.wait().await });
+    let serving = port.serve(listener, routes, async move { ended.wait().await });
     tokio::select! {
         served = serving => Ok(served?),
         () = async { late.wait().await; tokio::time::sleep(GRACE).await } => {

@@ -6,8 +6,9 @@ use anyhow::{Context, Result, anyhow};
 use futures::future::join_all;
 use getup_proto::v1;
 use getup_proto::v1::learner_client::LearnerClient;
+use getup_transport::{ChannelOptions, Credentials, Endpoint};
 use serde_json::json;
-use tonic::transport::Endpoint;
+use tonic::Status;
 
 use crate::config::ConfigArgs;
 
@@ -27,8 +28,10 @@ pub(crate) struct Args {
 pub(crate) async fn run(arguments: Args) -> Result<()> {
     let config = arguments.config.load()?;
     let replays = config.network.replays();
-    let asking = join_all(replays.iter().map(|address| ask_replay(address)));
-    let (replays, learner) = tokio::join!(asking, ask_learner(&config.network.learner));
+    let credentials = Credentials::load(&config.security)?;
+    let at = |address: &str| Endpoint::new(address, &credentials);
+    let asking = join_all(replays.iter().map(|address| ask_replay(at(address))));
+    let (replays, learner) = tokio::join!(asking, ask_learner(at(&config.network.learner)));
     if arguments.json {
         let replay = |replay: &Result<_>| {
             replay.as_ref().map_or_else(|error| json!({"error": format!("{error:#}")}), replay_json)
@@ -59,21 +62,20 @@ pub(crate) async fn run(arguments: Args) -> Result<()> {
     Ok(())
 }
 
-async fn channel(address: &str) -> Result<tonic::transport::Channel> {
-    let endpoint =
-        Endpoint::from_shared(format!("http://{address}")).with_context(|| format!("{address:?}"))?;
-    let endpoint = endpoint.connect_timeout(TIMEOUT).timeout(TIMEOUT);
-    endpoint.connect().await.with_context(|| format!("nothing answers at {address}"))
+async fn ask_replay(endpoint: Endpoint) -> Result<v1::DescribeReply> {
+    let address = endpoint.address.clone();
+    getup_replay::describe(endpoint).await.map_err(|status| unanswered(&address, &status))
 }
 
-async fn ask_replay(address: &str) -> Result<v1::DescribeReply> {
-    let asked = getup_replay::describe(address).await;
-    asked.map_err(|status| anyhow!("{address}: {}", status.message()))
+async fn ask_learner(endpoint: Endpoint) -> Result<v1::StatusReply> {
+    let mut client = LearnerClient::new(endpoint.channel(ChannelOptions::default())?);
+    let asked = tokio::time::timeout(TIMEOUT, client.status(v1::StatusRequest {})).await;
+    let asked = asked.with_context(|| format!("{}: no answer within {TIMEOUT:?}", endpoint.address))?;
+    Ok(asked.map_err(|status| unanswered(&endpoint.address, &status))?.into_inner())
 }
 
-async fn ask_learner(address: &str) -> Result<v1::StatusReply> {
-    let mut client = LearnerClient::new(channel(address).await?);
-    Ok(client.status(v1::StatusRequest {}).await?.into_inner())
+fn unanswered(address: &str, status: &Status) -> anyhow::Error {
+    anyhow!("{address}: {}", status.message())
 }
 
 fn version(version: Option<v1::PolicyVersion>) -> String {

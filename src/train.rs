@@ -65,7 +65,7 @@ pub(crate) fn run(mut arguments: Args) -> Result<()> {
         (None, true) => Start::Newest,
         (None, false) => Start::Untrained,
     };
-    let role = Role::new("train", arguments.log_format)?;
+    let role = Role::new("train", &config, arguments.log_format)?;
     let ending = if arguments.deterministic {
         role.run(async {
             tokio::task::block_in_place(|| deterministic::train(&config, &role, &folder, start))
@@ -172,6 +172,7 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_
     let options = sample_options(config, incarnation);
     let mut source = LocalSource::new(Arc::clone(&store), options, "learner", role.shutdown.clone())?;
     note_config(config, folder)?;
+    role.ready.set();
     let bar = progress::Progress::start(role, config, Arc::clone(&hub));
 
     let identity = Identity::new(&config.actor.name, config.seed);

@@ -199,6 +199,8 @@ pub struct Heartbeat {
     pub env_steps: u64,
     /// Why it does not step; empty while it does.
     pub waiting: String,
+    /// Whether this is its last.
+    pub leaving: bool,
 }
 
 impl From<Heartbeat> for v1::HeartbeatRequest {
@@ -206,10 +208,11 @@ impl From<Heartbeat> for v1::HeartbeatRequest {
         Self {
             actor: beat.actor,
             lease: beat.lease,
-            idle: beat.lease == 0,
+            idle: beat.lease == 0 && !beat.leaving,
             version: Some(beat.version.into()),
             env_steps: beat.env_steps,
             waiting: beat.waiting,
+            leaving: beat.leaving,
         }
     }
 }

@@ -14,6 +14,8 @@ use crate::metrics::ActorMetrics;
 
 /// How often an actor says that it is there.
 const HEARTBEAT: Duration = Duration::from_secs(1);
+/// How long the last one may take.
+const FAREWELL: Duration = Duration::from_secs(1);
 
 /// The correspondence of one actor. It holds at most one lease.
 pub(crate) struct Office<'a, L> {
@@ -54,14 +56,7 @@ impl<'a, L: LearnerLink> Office<'a, L> {
                 self.metrics.policy_version.set(version.counter as i64);
                 self.metrics.policy_age.set(newest.1.elapsed().as_secs_f64());
             }
-            let beat = Heartbeat {
-                actor: self.name.to_owned(),
-                lease: self.lease.load(Ordering::Relaxed),
-                version: version.unwrap_or_default(),
-                env_steps: self.metrics.env_steps.get(),
-                waiting: self.waiting(),
-            };
-            match self.link.heartbeat(beat).await {
+            match self.link.heartbeat(self.beat()).await {
                 Ok(lease) => {
                     last_error = None;
                     if let Some(lease) = lease {
@@ -74,6 +69,26 @@ impl<'a, L: LearnerLink> Office<'a, L> {
                     last_error = Some(error);
                 }
             }
+        }
+    }
+
+    fn beat(&self) -> Heartbeat {
+        let update = self.updates.borrow().clone();
+        Heartbeat {
+            actor: self.name.to_owned(),
+            lease: self.lease.load(Ordering::Relaxed),
+            version: update.map(|update| update.version).unwrap_or_default(),
+            env_steps: self.metrics.env_steps.get(),
+            waiting: self.waiting(),
+            leaving: false,
+        }
+    }
+
+    /// Says that the actor ends: nobody need miss it, and its lease is free. A learner that is away does not hear it.
+    pub(crate) async fn leave(&self) {
+        let last = self.link.heartbeat(Heartbeat { leaving: true, ..self.beat() });
+        if !matches!(tokio::time::timeout(FAREWELL, last).await, Ok(Ok(_))) {
+            tracing::debug!("the learner did not hear that this actor ends");
         }
     }
 

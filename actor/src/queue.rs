@@ -125,7 +125,7 @@ mod tests {
 
     #[tokio::test]
     async fn what_is_taken_makes_no_room_until_it_is_acknowledged() {
-        let metrics = ActorMetrics::new(&Registry::new());
+        let metrics = ActorMetrics::new(&Registry::new(), "actor");
         let (input, mut output) = queue(3, metrics.clone());
         let mut pending: VecDeque<Segment> = (0..5).map(segment).collect();
         input.fill_from(&mut pending);

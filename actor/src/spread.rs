@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use getup_proto::Segment;
+use getup_telemetry::prometheus::Histogram;
 use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinSet;
 
@@ -20,6 +21,7 @@ use crate::worker::ActorError;
 pub(crate) fn spread<W: SegmentWriter>(
     writers: Vec<W>,
     queue: QueueOutput,
+    append_seconds: &Histogram,
     tasks: &mut JoinSet<Result<(), ActorError>>,
 ) {
     let freed = Arc::new(Notify::new());
@@ -35,6 +37,7 @@ pub(crate) fn spread<W: SegmentWriter>(
             unacknowledged,
             freed: freed.clone(),
             acknowledgements: queue.acknowledgements(),
+            append_seconds: append_seconds.clone(),
         }));
     }
     tasks.spawn(distribute(queue, shares, desks, freed));
@@ -80,6 +83,7 @@ struct Appending<W> {
     unacknowledged: Arc<AtomicUsize>,
     freed: Arc<Notify>,
     acknowledgements: Acknowledgements,
+    append_seconds: Histogram,
 }
 
 /// Numbers the segments and appends them, all that are there at a time.
@@ -95,7 +99,9 @@ async fn append<W: SegmentWriter>(mut to: Appending<W>) -> Result<(), ActorError
             sequence += 1;
             (segment.writer, segment.sequence) = (to.link.writer(), sequence);
         }
+        let timer = to.append_seconds.start_timer();
         to.link.append(segments).await.map_err(ActorError::Refused)?;
+        timer.observe_duration();
         to.unacknowledged.fetch_sub(count, Ordering::AcqRel);
         to.freed.notify_one();
         to.acknowledgements.acknowledge(count);

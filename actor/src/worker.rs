@@ -86,7 +86,7 @@ pub async fn run<W: SegmentWriter, L: LearnerLink>(
 ) -> Result<(), ActorError> {
     assert!(!writers.is_empty(), "an actor writes somewhere");
     setup.config.validate()?;
-    let metrics = ActorMetrics::new(registry);
+    let metrics = ActorMetrics::new(registry, &setup.identity.name);
     let stop = StopOnDrop(Shutdown::new());
     let (slot, updates) = watch::channel(None);
     let (input, output) = queue(setup.config.queue_segments, metrics.clone());
@@ -103,7 +103,7 @@ pub async fn run<W: SegmentWriter, L: LearnerLink>(
     let threads = Threads { waits: &waits, stop: &stop.0, updates: &updates, queue: input };
     let mut threads = threads.start(&setup, control_limit, desk, &metrics)?;
     let mut writing = JoinSet::new();
-    spread(writers, output, &mut writing);
+    spread(writers, output, &metrics.append_seconds, &mut writing);
     let office = Office::new(&setup.identity.name, &link, updates, waits, metrics.clone());
 
     let result = tokio::select! {
@@ -117,6 +117,7 @@ pub async fn run<W: SegmentWriter, L: LearnerLink>(
     stop.0.trigger();
     let result = result.and(first_error_of_all(&mut threads).await);
     if result.is_ok() {
+        office.leave().await;
         drain(&mut writing, &setup.config, &metrics).await?;
     }
     let (segments, acknowledged) = (metrics.segments.get(), metrics.segments_acknowledged.get());

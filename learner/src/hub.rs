@@ -3,7 +3,7 @@
 //! The training thread publishes and offers; actors subscribe, send heartbeats and report, over gRPC
 //! ([`crate::service`]) or in the same process. Both ways use the messages of the wire.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
@@ -13,8 +13,12 @@ use tokio::sync::watch;
 
 use crate::leases::{LeaseError, Leases};
 
-/// A heartbeat older than this says that its actor is gone.
-const ACTOR_GONE: Duration = Duration::from_secs(60);
+/// A heartbeat older than this says that its actor is lost.
+pub(crate) const ACTOR_LOST: Duration = Duration::from_secs(60);
+/// One that is lost for so long is forgotten.
+const ACTOR_FORGOTTEN: Duration = Duration::from_secs(600);
+/// Policies of which it is known when they were published.
+const PUBLISHED: usize = 1024;
 
 /// Why a message of an actor is refused; nothing was changed.
 #[derive(Debug, thiserror::Error)]
@@ -71,6 +75,21 @@ struct State {
     leases: Leases<Evaluation, Vec<v1::EpisodeResult>>,
     actors: BTreeMap<String, ActorEntry>,
     standing: Standing,
+    /// Counters of the newest policies, oldest first, and when they came.
+    published: VecDeque<(u64, Instant)>,
+}
+
+/// What the learner knows of an actor, as of its last heartbeat.
+#[derive(Clone, PartialEq, Debug)]
+pub struct ActorView {
+    /// Its name.
+    pub name: String,
+    /// Since its last heartbeat.
+    pub silent: Duration,
+    /// Policies published since the one it acts by.
+    pub versions_behind: u64,
+    /// For how long it has been without the policy that followed its own.
+    pub lag: Duration,
 }
 
 /// The meeting place of one learner and its actors.
@@ -82,6 +101,7 @@ pub struct Hub {
     policy: watch::Sender<Arc<v1::PolicyUpdate>>,
     state: Mutex<State>,
     reported: Condvar,
+    incarnation: u64,
     /// Lease numbers on the wire are these plus the table's: those of an earlier learner stay unknown.
     lease_base: u64,
 }
@@ -90,8 +110,12 @@ impl Hub {
     /// A hub whose evaluations start from `seeds` and whose leases last `keep_alive`. `incarnation` numbers the
     /// learner's starts on this run.
     pub fn new(spec: RunSpec, seeds: Vec<u64>, keep_alive: Duration, incarnation: u64, waits: Waits) -> Self {
-        let state =
-            State { leases: Leases::new(keep_alive), actors: BTreeMap::new(), standing: Standing::default() };
+        let state = State {
+            leases: Leases::new(keep_alive),
+            actors: BTreeMap::new(),
+            standing: Standing::default(),
+            published: VecDeque::new(),
+        };
         Self {
             spec,
             seeds,
@@ -100,6 +124,7 @@ impl Hub {
             policy: watch::Sender::new(Arc::default()),
             state: Mutex::new(state),
             reported: Condvar::new(),
+            incarnation,
             lease_base: incarnation << 32,
         }
     }
@@ -117,6 +142,13 @@ impl Hub {
 
     /// Broadcasts a policy; whoever has not taken the one before it never sees that one.
     pub fn publish(&self, policy: Arc<v1::PolicyUpdate>) {
+        if let Some(version) = policy.version {
+            let mut state = self.lock();
+            state.published.push_back((version.counter, Instant::now()));
+            if state.published.len() > PUBLISHED {
+                state.published.pop_front();
+            }
+        }
         self.policy.send_replace(policy);
     }
 
@@ -156,9 +188,14 @@ impl Hub {
         if let Some(lease) = request.lease.checked_sub(self.lease_base) {
             state.leases.keep_alive(lease, &name, now);
         }
+        if request.leaving {
+            state.leases.release(&name);
+            state.actors.remove(&name);
+            return Ok(v1::HeartbeatReply { lease: None });
+        }
         let lease = if request.idle { self.lease(&mut state, &name, now) } else { None };
         state.actors.insert(name, ActorEntry { heartbeat: request, seen: now });
-        state.actors.retain(|_, actor| now.duration_since(actor.seen) < ACTOR_GONE);
+        state.actors.retain(|_, actor| now.duration_since(actor.seen) < ACTOR_FORGOTTEN);
         Ok(v1::HeartbeatReply { lease })
     }
 
@@ -188,6 +225,37 @@ impl Hub {
         self.lock().leases.report(lease, report.episodes).map_err(|_| LeaseError::NotHeld(report.lease))?;
         self.reported.notify_all();
         Ok(())
+    }
+
+    /// Every actor that was heard from within the last minutes and has not said that it ends.
+    pub fn actors(&self, now: Instant) -> Vec<ActorView> {
+        let state = self.lock();
+        let view = |(name, actor): (&String, &ActorEntry)| {
+            let silent = now.duration_since(actor.seen);
+            let version = actor.heartbeat.version.unwrap_or_default();
+            // A policy of an earlier learner is older than all of this one.
+            let counter = (version.incarnation == self.incarnation).then_some(version.counter);
+            let newer = |published: &&(u64, Instant)| counter.is_none_or(|counter| published.0 > counter);
+            let next = state.published.iter().find(newer);
+            let newest = state.published.back().map_or(0, |(counter, _)| *counter);
+            ActorView {
+                name: name.clone(),
+                silent,
+                versions_behind: counter.map_or(newest + 1, |counter| newest.saturating_sub(counter)),
+                lag: next.map_or(Duration::ZERO, |(_, since)| actor.seen.saturating_duration_since(*since)),
+            }
+        };
+        state
+            .actors
+            .iter()
+            .filter(|(_, actor)| now.duration_since(actor.seen) < ACTOR_FORGOTTEN)
+            .map(view)
+            .collect()
+    }
+
+    /// Evaluations on offer, on lease, and how many leases were lost by their holders' silence.
+    pub fn lease_counts(&self) -> (usize, usize, u64) {
+        self.lock().leases.counts()
     }
 
     /// Takes what the training thread tells of itself.

@@ -39,13 +39,14 @@ enum State<R> {
 pub struct Leases<T, R> {
     keep_alive: Duration,
     next_id: u64,
+    expirations: u64,
     table: VecDeque<(T, State<R>)>,
 }
 
 impl<T, R> Leases<T, R> {
     /// A table whose leases last `keep_alive` beyond the last heartbeat.
     pub fn new(keep_alive: Duration) -> Self {
-        Self { keep_alive, next_id: 1, table: VecDeque::new() }
+        Self { keep_alive, next_id: 1, expirations: 0, table: VecDeque::new() }
     }
 
     /// Evaluations that are offered, leased, or reported and not yet taken.
@@ -86,6 +87,23 @@ impl<T, R> Leases<T, R> {
         })
     }
 
+    /// Offers again what `holder` holds: it ends.
+    pub fn release(&mut self, holder: &str) {
+        for (_, state) in &mut self.table {
+            if matches!(state, State::Leased { holder: held_by, .. } if held_by == holder) {
+                *state = State::Offered;
+            }
+        }
+    }
+
+    /// Evaluations on offer, on lease, and leases that were lost by their holders' silence.
+    pub fn counts(&self) -> (usize, usize, u64) {
+        let count =
+            |wanted: fn(&State<R>) -> bool| self.table.iter().filter(|(_, state)| wanted(state)).count();
+        let offered = count(|state| matches!(state, State::Offered));
+        (offered, count(|state| matches!(state, State::Leased { .. })), self.expirations)
+    }
+
     /// Takes the report of a lease.
     pub fn report(&mut self, lease: u64, result: R) -> Result<(), LeaseError> {
         let held = self
@@ -123,6 +141,7 @@ impl<T, R> Leases<T, R> {
         for (_, state) in &mut self.table {
             if matches!(state, State::Leased { expires, .. } if *expires <= now) {
                 *state = State::Offered;
+                self.expirations += 1;
             }
         }
     }

@@ -29,6 +29,8 @@ pub mod device;
 #[cfg(feature = "torch")]
 pub mod hub;
 #[cfg(feature = "torch")]
+pub mod hub_metrics;
+#[cfg(feature = "torch")]
 mod metrics;
 #[cfg(feature = "torch")]
 mod networks;

@@ -2,11 +2,12 @@
 
 use getup_telemetry::Registry;
 use getup_telemetry::prometheus::{
-    Gauge, Histogram, HistogramOpts, IntCounter, IntGauge, register_gauge_with_registry,
+    CounterVec, Gauge, GaugeVec, Histogram, HistogramOpts, IntCounter, IntGauge,
+    register_counter_vec_with_registry, register_gauge_vec_with_registry, register_gauge_with_registry,
     register_histogram_with_registry, register_int_counter_with_registry, register_int_gauge_with_registry,
 };
 
-use crate::sac::Losses;
+use crate::sac::{Losses, Norms, Phases};
 
 /// Handles to everything the learner exposes.
 #[derive(Clone)]
@@ -15,6 +16,10 @@ pub(crate) struct LearnerMetrics {
     pub(crate) env_steps: IntGauge,
     pub(crate) update_seconds: Histogram,
     pub(crate) wait_seconds: Histogram,
+    phases: CounterVec,
+    gradient_norm: GaugeVec,
+    weight_norm: GaugeVec,
+    pub(crate) loss_not_finite: IntGauge,
     critic_loss: Gauge,
     actor_loss: Gauge,
     temperature: Gauge,
@@ -51,6 +56,10 @@ impl LearnerMetrics {
         let gauge = |name: &str, help: &str| {
             register_gauge_with_registry!(format!("getup_learner_{name}"), help, registry).expect(PROVEN)
         };
+        let by_network = |name: &str, help: &str| {
+            register_gauge_vec_with_registry!(format!("getup_learner_{name}"), help, &["network"], registry)
+                .expect(PROVEN)
+        };
         let seconds = |name: &str, help: &str| {
             let buckets = (0..16).map(|power| 1e-4 * 2f64.powi(power)).collect();
             let options = HistogramOpts::new(format!("getup_learner_{name}"), help).buckets(buckets);
@@ -64,6 +73,17 @@ impl LearnerMetrics {
                 "Time of one update, without waiting for its minibatch.",
             ),
             wait_seconds: seconds("wait_seconds", "Time waited for a minibatch."),
+            phases: {
+                let help = "Time of updates, by phase: batch, critics, actor, optimizer.";
+                let name = "getup_learner_update_phase_seconds_total";
+                register_counter_vec_with_registry!(name, help, &["phase"], registry).expect(PROVEN)
+            },
+            gradient_norm: by_network("gradient_norm", "Euclidean norm of the gradient, by network."),
+            weight_norm: by_network("weight_norm", "Euclidean norm of the weights, by network."),
+            loss_not_finite: whole(
+                "loss_not_finite",
+                "1 once training stopped because a loss was no number any more.",
+            ),
             critic_loss: gauge("critic_loss", "Mean squared error of the critics, summed over them."),
             actor_loss: gauge("actor_loss", "Mean of temperature times log-probability less Q."),
             temperature: gauge("temperature", "SAC's temperature."),
@@ -96,6 +116,22 @@ impl LearnerMetrics {
             checkpoints: counter("checkpoints_total", "Checkpoints written since this process started."),
             checkpoint_seconds: seconds("checkpoint_seconds", "Time to write a checkpoint, beside training."),
             finished: whole("finished", "1 once training is over."),
+        }
+    }
+
+    /// Adds the time of an update: until its batch was ready, and where `phases` has more than `before`.
+    pub(crate) fn phases(&self, batch: f64, before: Phases, phases: Phases) {
+        let add = |phase: &str, seconds: f64| self.phases.with_label_values(&[phase]).inc_by(seconds);
+        add("batch", batch);
+        add("critics", phases.critics - before.critics);
+        add("actor", phases.actor - before.actor);
+        add("optimizer", phases.optimizer - before.optimizer);
+    }
+
+    pub(crate) fn norms(&self, norms: &Norms) {
+        for (network, [weight, gradient]) in [("actor", norms.actor), ("critics", norms.critics)] {
+            self.weight_norm.with_label_values(&[network]).set(weight);
+            self.gradient_norm.with_label_values(&[network]).set(gradient);
         }
     }
 

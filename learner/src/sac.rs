@@ -2,6 +2,8 @@
 //!
 //! [`Sac::update`] reads top to bottom like the paper: target, critic loss, actor loss, temperature loss, Polyak.
 
+use std::time::Instant;
+
 use getup_policy::Policy;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -72,6 +74,42 @@ pub struct Losses {
     pub q: f64,
 }
 
+/// Where the time of updates went, in seconds since this process began. On a GPU, whose work is waited for at each loss, it
+/// is the time until then.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Phases {
+    /// The critics' targets, losses and gradients.
+    pub critics: f64,
+    /// The actor's loss and gradient.
+    pub actor: f64,
+    /// Steps of AdamW and of Polyak averaging.
+    pub optimizer: f64,
+}
+
+/// Euclidean norms of what an update works with.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Norms {
+    /// Of the actor's weights, and of its gradient at the last update.
+    pub actor: [f64; 2],
+    /// Of all critics' weights, and of their gradient at the last update.
+    pub critics: [f64; 2],
+}
+
+/// Adds the time since it was last asked.
+struct Lap(Instant);
+
+impl Lap {
+    fn start() -> Self {
+        Self(Instant::now())
+    }
+
+    fn add_to(&mut self, phase: &mut f64) {
+        let now = Instant::now();
+        *phase += now.duration_since(self.0).as_secs_f64();
+        self.0 = now;
+    }
+}
+
 /// A loss that is not a number any more. The networks are those of before the update that found it, or differ
 /// from them by finite steps: the last checkpoint is good.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -105,6 +143,10 @@ pub struct Sac {
     pub(crate) updates: u64,
     /// See [`Sac::td_errors`].
     td_errors: Vec<f32>,
+    /// See [`Sac::phases`].
+    phases: Phases,
+    /// `[n]` each, of the last update by autograd: of the critics, of the actor.
+    gradients: Option<[Tensor; 2]>,
     /// The update for processors, laid out at the first one; see [`Sac::changed`].
     cpu: OnCpu,
 }
@@ -144,6 +186,8 @@ impl Sac {
             rng,
             updates: 0,
             td_errors: Vec::new(),
+            phases: Phases::default(),
+            gradients: None,
             cpu: OnCpu::Unknown,
         }
     }
@@ -182,6 +226,25 @@ impl Sac {
         &self.td_errors
     }
 
+    /// Where the time of all updates went.
+    pub fn phases(&self) -> Phases {
+        self.phases
+    }
+
+    /// Norms of weights and gradients as they are now.
+    pub fn norms(&self) -> Norms {
+        let norm = |tensor: &Tensor| tensor.norm().double_value(&[]);
+        let [critics, actor] = match (&self.cpu, &self.gradients) {
+            (OnCpu::Ready(cpu), _) => cpu.gradient_norms(),
+            (_, Some(gradients)) => gradients.each_ref().map(norm),
+            (_, None) => [0.0; 2],
+        };
+        Norms {
+            actor: [norm(self.actor.parameters.flat()), actor],
+            critics: [norm(self.critics.parameters.flat()), critics],
+        }
+    }
+
     /// One update of critics, actor, temperature and targets.
     pub fn update(&mut self, batch: &Batch) -> Result<Losses, NonFiniteLoss> {
         let count = batch.action.len();
@@ -215,6 +278,7 @@ impl Sac {
         next_noise: &[f32],
         noise: &[f32],
     ) -> Result<Losses, NonFiniteLoss> {
+        let mut lap = Lap::start();
         let rows = batch.rows() as i64;
         let matrix = |values: &[f32]| Tensor::from_slice(values).view([rows, -1]).to_device(self.device);
         let column = |values: &[f32]| Tensor::from_slice(values).to_device(self.device);
@@ -241,22 +305,27 @@ impl Sac {
         let errors = error.abs().mean_dim(&[0i64][..], false, Kind::Float).to_device(Device::Cpu);
         self.td_errors = Vec::try_from(&errors).expect("errors are numbers");
         let critic = self.finite("critic", critic_loss.double_value(&[]))?;
-        let gradient = self.critics.parameters.gradient(&critic_loss);
-        self.critics_adam.step(&mut self.critics.parameters, &gradient);
+        let critics_gradient = self.critics.parameters.gradient(&critic_loss);
+        lap.add_to(&mut self.phases.critics);
+        self.critics_adam.step(&mut self.critics.parameters, &critics_gradient);
+        lap.add_to(&mut self.phases.optimizer);
 
         // mean (α log π(a|s) − min Q(s, a)), a ~ π(s)
         let sample = self.actor.forward(&observation).sample(&beta, &noise);
         let value = self.critics.minimum(&observation, &sample.action);
         let actor_loss = (&sample.log_prob * temperature - value).mean(Kind::Float);
         let actor = self.finite("actor", actor_loss.double_value(&[]))?;
+        let actor_gradient = self.actor.parameters.gradient(&actor_loss);
+        lap.add_to(&mut self.phases.actor);
         if self.actor_learns() {
-            let gradient = self.actor.parameters.gradient(&actor_loss);
-            self.actor_adam.step(&mut self.actor.parameters, &gradient);
+            self.actor_adam.step(&mut self.actor.parameters, &actor_gradient);
         }
+        self.gradients = Some([critics_gradient, actor_gradient]);
 
         let entropy = -sample.log_prob.mean(Kind::Float).double_value(&[]);
         polyak(&mut self.targets.parameters, &self.critics.parameters, self.config.tau);
         let q = q.mean(Kind::Float).double_value(&[]);
+        lap.add_to(&mut self.phases.optimizer);
         Ok(self.end_update(critic, actor, entropy, q))
     }
 
@@ -268,6 +337,7 @@ impl Sac {
         next_noise: &[f32],
         noise: &[f32],
     ) -> Result<Losses, NonFiniteLoss> {
+        let mut lap = Lap::start();
         let statistics = self.config.normalize_observations.then(|| self.statistics.snapshot());
         let [mut actor, mut critics, mut targets] =
             [&self.actor.parameters, &self.critics.parameters, &self.targets.parameters]
@@ -280,17 +350,21 @@ impl Sac {
         let critic = cpu.critics_backward(&inputs, Values { actor, critics, targets });
         let critic_loss = self.finite("critic", critic.loss)?;
         cpu.td_errors(&mut self.td_errors);
+        lap.add_to(&mut self.phases.critics);
         let step = self.critics_adam.begin_step();
         let (first, second) = self.critics_adam.moments();
         cpu.critics_step(Flat { values: critics, first, second }, targets, step, self.config.tau as f32);
 
+        lap.add_to(&mut self.phases.optimizer);
         let policy = cpu.actor_backward(&inputs, Values { actor, critics, targets });
         let actor_loss = self.finite("actor", policy.loss)?;
+        lap.add_to(&mut self.phases.actor);
         if self.actor_learns() {
             let step = self.actor_adam.begin_step();
             let (first, second) = self.actor_adam.moments();
             cpu.actor_step(Flat { values: actor, first, second }, step);
         }
+        lap.add_to(&mut self.phases.optimizer);
         Ok(self.end_update(critic_loss, actor_loss, policy.value, critic.value))
     }
 

@@ -245,11 +245,14 @@ impl Trainer {
             self.sac.merge_statistics(&batch);
         }
         self.sac.anneal(self.progress.env_steps);
-        let losses = self.sac.update(&batch)?;
+        let (batch_seconds, before) = (started.elapsed().as_secs_f64(), self.sac.phases());
+        let losses = self.sac.update(&batch).inspect_err(|_| self.metrics.loss_not_finite.set(1))?;
+        self.metrics.phases(batch_seconds, before, self.sac.phases());
         self.metrics.updates.inc();
         self.metrics.update_seconds.observe(started.elapsed().as_secs_f64());
         if self.pace.count() {
             self.metrics.losses(&losses);
+            self.metrics.norms(&self.sac.norms());
             self.show();
         }
         self.take_reports()?;

@@ -204,3 +204,43 @@ async fn actors_of_another_run_and_without_a_name_are_refused() {
     }
     shutdown.trigger();
 }
+
+#[test]
+fn who_is_behind_or_silent_is_seen_and_who_leaves_is_not_missed() {
+    let hub = hub(Duration::from_secs(10));
+    let beat = |actor: &str, counter| v1::HeartbeatRequest {
+        actor: actor.into(),
+        version: Some(v1::PolicyVersion { incarnation: 3, counter }),
+        idle: true,
+        ..v1::HeartbeatRequest::default()
+    };
+    for counter in 1..=3 {
+        hub.publish(policy(counter));
+    }
+    let now = Instant::now();
+    hub.heartbeat(beat("newest", 3), now).unwrap();
+    hub.heartbeat(beat("behind", 1), now).unwrap();
+    let earlier = v1::PolicyVersion { incarnation: 2, counter: 900 };
+    hub.heartbeat(v1::HeartbeatRequest { version: Some(earlier), ..beat("earlier", 0) }, now).unwrap();
+    let later = now + Duration::from_secs(5);
+    let actors = hub.actors(later);
+    let behind: Vec<_> = actors.iter().map(|actor| (actor.name.as_str(), actor.versions_behind)).collect();
+    assert_eq!(behind, [("behind", 2), ("earlier", 4), ("newest", 0)]);
+    assert!(actors.iter().all(|actor| actor.silent == Duration::from_secs(5)));
+    assert!(actors[0].lag > Duration::ZERO && actors[0].lag < Duration::from_secs(60));
+    assert_eq!(actors[2].lag, Duration::ZERO);
+
+    hub.offer(Evaluation { policy: policy(3), updates: 7 });
+    assert_eq!(hub.lease_counts(), (1, 0, 0));
+    assert!(hub.heartbeat(beat("behind", 3), later).unwrap().lease.is_some());
+    assert_eq!(hub.lease_counts(), (0, 1, 0));
+    hub.heartbeat(v1::HeartbeatRequest { leaving: true, ..beat("behind", 3) }, later).unwrap();
+    assert_eq!(hub.lease_counts(), (1, 0, 0), "its lease is free at once");
+    assert_eq!(hub.actors(later).len(), 2);
+    // A holder that falls silent loses its lease, and after ten minutes nobody speaks of it.
+    assert!(hub.heartbeat(beat("newest", 3), later).unwrap().lease.is_some());
+    let much_later = later + Duration::from_secs(601);
+    assert!(hub.heartbeat(beat("another", 3), much_later).unwrap().lease.is_some());
+    assert_eq!(hub.lease_counts(), (0, 1, 1));
+    assert_eq!(hub.actors(much_later).len(), 1);
+}

@@ -133,7 +133,7 @@ fn the_toy_task_is_learned_from_a_prioritized_table_over_grpc() {
     let shutdown = Shutdown::new();
     let serving = runtime.spawn(serve(listener, store(&dir), shutdown.clone()));
     let remote = RemoteOptions {
-        endpoint,
+        endpoint: (&endpoint).into(),
         spec: spec(),
         sample: options(),
         name: "learner".to_owned(),

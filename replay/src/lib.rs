@@ -19,12 +19,13 @@
 //! | `limiter` | Reverb's cursor between two bounds, a pure state machine |
 //! | `gate` | the limiter with its doors: who waits there, and for whom |
 //! | `tables` | [`Tables`]: stores by name, behind one address |
-//! | `service` | [`serve`]: the streams of writers and samplers |
+//! | `service` | [`serve_at`]: the streams of writers and samplers |
 //! | `source`, `remote`, `shards` | [`MinibatchSource`], in process, over gRPC, and from several services; [`describe`] |
 //! | `export` | a store's transitions for other tools |
-//! | `minibatch`, `config`, `error`, `metrics` | [`Minibatch`], [`ReplayConfig`], [`StoreError`], [`ReplayMetrics`] |
+//! | `minibatch`, `config`, `error`, `metrics`, `disk` | [`Minibatch`], [`ReplayConfig`], [`StoreError`], [`ReplayMetrics`] |
 
 mod config;
+mod disk;
 mod error;
 mod export;
 mod gate;
@@ -59,7 +60,7 @@ pub use minibatch::{
 pub use remote::{RemoteOptions, RemoteSource, describe, describe_table, take_snapshot, update_priorities};
 pub use sampler::Sampler;
 pub use selector::ItemSelector;
-pub use service::{ServeError, serve};
+pub use service::{ServeError, limits, serve, serve_at};
 pub use shards::ShardedSource;
 pub use source::{LocalSource, MinibatchSource, SampleError};
 pub use store::Store;

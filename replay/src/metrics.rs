@@ -1,5 +1,6 @@
 //! What `/metrics` says of a replay: [`ReplayMetrics`], all names `getup_replay_…`.
 
+use crate::disk::Disk;
 use crate::tables::DEFAULT_TABLE;
 use getup_telemetry::prometheus::{
     Gauge, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry, core::Collector,
@@ -12,7 +13,7 @@ pub struct ReplayMetrics {
     pub(crate) transitions: IntGauge,
     pub(crate) capacity: IntGauge,
     pub(crate) memory_bytes: IntGauge,
-    pub(crate) disk_bytes: IntGauge,
+    pub(crate) disk: Disk,
     pub(crate) inserted_env_steps: IntCounter,
     pub(crate) inserted_transitions: IntCounter,
     pub(crate) episodes: IntCounter,
@@ -61,11 +62,14 @@ impl ReplayMetrics {
         };
         let rejected = options("rejected_total", "Appends and samples refused, by reason.");
         let rejected = IntCounterVec::new(rejected, &["reason"]).expect(WELL_FORMED);
+        for reason in REASONS {
+            rejected.with_label_values(&[reason]);
+        }
         Self {
             transitions: gauge("transitions", "Transitions that can be sampled now."),
             capacity: gauge("capacity_transitions", "Transitions that fit."),
             memory_bytes: gauge("memory_bytes", "Memory of a full ring."),
-            disk_bytes: gauge("disk_bytes", "Disk space of the log."),
+            disk: added(registry, Disk::new(table)),
             inserted_env_steps: counter("env_steps_total", "Env steps ever stored."),
             inserted_transitions: counter(
                 "inserted_transitions_total",
@@ -102,6 +106,20 @@ impl ReplayMetrics {
     }
 }
 
+/// Why appends and samples are refused.
+const REASONS: [&str; 11] = [
+    "hello",
+    "table",
+    "spec",
+    "options",
+    "writer",
+    "sequence",
+    "inconsistent",
+    "length",
+    "dimensions",
+    "checksum",
+    "non_finite",
+];
 const WELL_FORMED: &str = "names, labels and buckets are well-formed";
 
 fn added<C: Collector + Clone + 'static>(registry: &Registry, collector: C) -> C {

@@ -6,13 +6,13 @@ use crate::source::{MinibatchSource, SampleError};
 use getup_proto::v1::replay_client::ReplayClient;
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, v1};
 use getup_telemetry::{Backoff, Shutdown, Waits};
+use getup_transport::{AddressError, Channel, ChannelOptions, Endpoint, Window};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Status};
 
 /// How often a wait looks whether it was cancelled.
@@ -54,8 +54,8 @@ pub struct RemoteSource {
 /// What a [`RemoteSource`] asks for, and where.
 #[derive(Clone, Debug)]
 pub struct RemoteOptions {
-    /// Where the service listens, as `host:port`.
-    pub endpoint: String,
+    /// Where the service is.
+    pub endpoint: Endpoint,
     /// The table that is sampled; empty for the default.
     pub table: String,
     /// The table's spec: a service with another refuses.
@@ -183,7 +183,7 @@ impl MinibatchSource for RemoteSource {
 ///
 /// # Errors
 /// UNAVAILABLE if the service is not there, DEADLINE_EXCEEDED if it does not answer.
-pub async fn describe(endpoint: &str) -> Result<v1::DescribeReply, Status> {
+pub async fn describe(endpoint: impl Into<Endpoint>) -> Result<v1::DescribeReply, Status> {
     describe_table(endpoint, "").await
 }
 
@@ -191,9 +191,8 @@ pub async fn describe(endpoint: &str) -> Result<v1::DescribeReply, Status> {
 ///
 /// # Errors
 /// As [`describe`]; NOT_FOUND if it has no such table.
-pub async fn describe_table(endpoint: &str, table: &str) -> Result<v1::DescribeReply, Status> {
-    let channel = connect(endpoint).await.map_err(|error| Status::unavailable(error.to_string()))?;
-    ask(ReplayClient::new(channel), table).await
+pub async fn describe_table(endpoint: impl Into<Endpoint>, table: &str) -> Result<v1::DescribeReply, Status> {
+    ask(client(&endpoint.into())?, table).await
 }
 
 /// Gives transitions of a service's table (empty for the default) priorities, by their keys; returns how many were still there.
@@ -201,14 +200,12 @@ pub async fn describe_table(endpoint: &str, table: &str) -> Result<v1::DescribeR
 /// # Errors
 /// As [`describe`]; INVALID_ARGUMENT if one is negative or not finite, and then none is given.
 pub async fn update_priorities(
-    endpoint: &str,
+    endpoint: impl Into<Endpoint>,
     table: &str,
     priorities: &[(u64, f32)],
 ) -> Result<u64, Status> {
-    let channel = connect(endpoint).await.map_err(|error| Status::unavailable(error.to_string()))?;
     let (keys, priorities) = priorities.iter().copied().unzip();
-    let mut client = ReplayClient::new(channel).max_encoding_message_size(MAX_MESSAGE_BYTES);
-    let reply = client
+    let reply = client(&endpoint.into())?
         .update_priorities(v1::UpdatePrioritiesRequest { keys, priorities, table: table.to_owned() })
         .await?;
     Ok(reply.into_inner().updated)
@@ -218,10 +215,13 @@ pub async fn update_priorities(
 ///
 /// # Errors
 /// As [`describe`]; INVALID_ARGUMENT if the name is none, FAILED_PRECONDITION if the copy cannot be made.
-pub async fn take_snapshot(endpoint: &str, table: &str, name: &str) -> Result<v1::SnapshotReply, Status> {
-    let channel = connect(endpoint).await.map_err(|error| Status::unavailable(error.to_string()))?;
+pub async fn take_snapshot(
+    endpoint: impl Into<Endpoint>,
+    table: &str,
+    name: &str,
+) -> Result<v1::SnapshotReply, Status> {
     let request = v1::SnapshotRequest { name: name.to_owned(), table: table.to_owned() };
-    ReplayClient::new(channel).snapshot(request).await.map(tonic::Response::into_inner)
+    client(&endpoint.into())?.snapshot(request).await.map(tonic::Response::into_inner)
 }
 
 async fn ask(mut client: ReplayClient<Channel>, table: &str) -> Result<v1::DescribeReply, Status> {
@@ -230,16 +230,21 @@ async fn ask(mut client: ReplayClient<Channel>, table: &str) -> Result<v1::Descr
     answer.map_err(|_| Status::deadline_exceeded("replay does not answer"))?.map(tonic::Response::into_inner)
 }
 
-async fn connect(endpoint: &str) -> Result<Channel, tonic::transport::Error> {
-    Endpoint::from_shared(format!("http://{endpoint}"))?
-        .connect_timeout(CALL_PATIENCE)
-        .tcp_nodelay(true)
-        .http2_keep_alive_interval(PING_EVERY)
-        .keep_alive_timeout(PING_EVERY)
-        .initial_stream_window_size(STREAM_WINDOW_BYTES)
-        .initial_connection_window_size(STREAM_WINDOW_BYTES)
-        .connect()
-        .await
+/// A client whose calls say when the service is not there.
+fn client(endpoint: &Endpoint) -> Result<ReplayClient<Channel>, Status> {
+    let channel = channel(endpoint).map_err(|error| Status::invalid_argument(error.to_string()))?;
+    Ok(ReplayClient::new(channel).max_encoding_message_size(MAX_MESSAGE_BYTES))
+}
+
+fn channel(endpoint: &Endpoint) -> Result<Channel, AddressError> {
+    endpoint.channel(ChannelOptions {
+        connect_timeout: CALL_PATIENCE,
+        keep_alive_interval: PING_EVERY,
+        keep_alive_timeout: PING_EVERY,
+        keep_alive_while_idle: false,
+        window: Window::Fixed { stream: STREAM_WINDOW_BYTES, connection: STREAM_WINDOW_BYTES },
+        ..ChannelOptions::default()
+    })
 }
 
 /// The task of a [`RemoteSource`].
@@ -271,16 +276,16 @@ impl Fetching {
     async fn run(mut self) {
         let mut backoff = Backoff::new();
         loop {
-            self.explain(format!("a connection to replay at {}", self.options.endpoint));
+            self.explain(format!("a connection to replay at {}", self.options.endpoint.address));
             match self.stream(&mut backoff).await {
                 End::Dropped => return,
                 End::Gone(why) => {
-                    self.explain(format!("replay at {} is gone ({why})", self.options.endpoint));
-                    tracing::debug!("replay at {} is gone: {why}", self.options.endpoint);
+                    self.explain(format!("replay at {} is gone ({why})", self.options.endpoint.address));
+                    tracing::debug!("replay at {} is gone: {why}", self.options.endpoint.address);
                     tokio::time::sleep(backoff.next()).await;
                 }
                 End::Refused(reason) => {
-                    let endpoint = self.options.endpoint.clone();
+                    let endpoint = self.options.endpoint.address.clone();
                     // There is a place for it; a source that was dropped needs it no more.
                     let _ = self.queue.try_send(Err(SampleError::Refused { endpoint, reason }));
                     self.ring();
@@ -295,9 +300,9 @@ impl Fetching {
 
     /// One connection, from hello to its end.
     async fn stream(&mut self, backoff: &mut Backoff) -> End {
-        let channel = match connect(&self.options.endpoint).await {
+        let channel = match channel(&self.options.endpoint) {
             Ok(channel) => channel,
-            Err(error) => return End::Gone(root_cause(&error)),
+            Err(error) => return End::Refused(error.to_string()),
         };
         let mut client = ReplayClient::new(channel.clone())
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
@@ -360,7 +365,7 @@ impl Fetching {
                 _ = asked_why.tick(), if self.queued == 0 => {
                     if let Ok(described) = ask(ReplayClient::new(channel.clone()), &self.options.table).await {
                         let waiting = described.limiter.map(|limiter| limiter.waiting).unwrap_or_default();
-                        let default = || format!("minibatches from replay at {}", self.options.endpoint);
+                        let default = || format!("minibatches from replay at {}", self.options.endpoint.address);
                         self.explain(if waiting.is_empty() { default() } else { waiting });
                     }
                 },
@@ -442,15 +447,6 @@ impl From<Status> for End {
 
 fn credits_message(credits: u32) -> v1::sample_request::Message {
     v1::sample_request::Message::Credits(credits)
-}
-
-/// The innermost error: "connection refused" says more than "transport error".
-fn root_cause(error: &dyn std::error::Error) -> String {
-    let mut cause = error;
-    while let Some(source) = cause.source() {
-        cause = source;
-    }
-    cause.to_string()
 }
 
 fn lock(reason: &Reason) -> std::sync::MutexGuard<'_, String> {

@@ -5,6 +5,7 @@ use crate::minibatch::Minibatch;
 use crate::remote::{Bell, REASON_TICK, RemoteOptions, RemoteSource};
 use crate::source::{MinibatchSource, SampleError};
 use getup_telemetry::{Shutdown, Waits};
+use getup_transport::Endpoint;
 use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
 
@@ -48,7 +49,7 @@ impl ShardedSource {
     /// # Panics
     /// If there are no endpoints.
     pub fn new(
-        endpoints: &[String],
+        endpoints: &[Endpoint],
         options: &RemoteOptions,
         runtime: &Handle,
         waits: Waits,
@@ -56,7 +57,7 @@ impl ShardedSource {
     ) -> Self {
         assert!(!endpoints.is_empty(), "a source samples somewhere");
         let arrivals = Bell::default();
-        let shard = |(index, endpoint): (usize, &String)| {
+        let shard = |(index, endpoint): (usize, &Endpoint)| {
             let mut options = RemoteOptions { endpoint: endpoint.clone(), ..options.clone() };
             // No two draw alike.
             options.sample.seed = options.sample.seed.wrapping_add((index as u64) << 48);

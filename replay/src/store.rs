@@ -23,8 +23,6 @@ use std::time::{Duration, Instant};
 
 /// How often a full disk is tried again.
 const FULL_TICK: Duration = Duration::from_millis(250);
-/// How often the disk space is measured, at most.
-const MEASURE_EVERY: Duration = Duration::from_secs(5);
 
 /// A replay store. Threads share it in an [`Arc`].
 #[derive(Debug)]
@@ -38,7 +36,7 @@ pub struct Store {
     /// Whether draws change the ring.
     selects: bool,
     /// Locked by one append at a time, for as long as the disk takes.
-    log: Mutex<Writing>,
+    log: Mutex<Log>,
     /// Locked briefly.
     memory: RwLock<Memory>,
     /// Locked for as long as a snapshot takes.
@@ -47,13 +45,6 @@ pub struct Store {
     watermark: Arc<Watermark>,
     metrics: ReplayMetrics,
     waits: Waits,
-}
-
-/// What appends need.
-#[derive(Debug)]
-struct Writing {
-    log: Log,
-    disk_measured: Instant,
 }
 
 /// What sampling needs.
@@ -100,7 +91,7 @@ impl Store {
         metrics.sampled.inc_by(sampled);
         metrics.capacity.set(config.capacity as i64);
         metrics.memory_bytes.set(ring.memory_bytes() as i64);
-        metrics.disk_bytes.set(log::disk_bytes(dir) as i64);
+        metrics.disk.watch(dir);
         if let Some((_, min, max)) = limiter.band() {
             metrics.cursor_min.set(min);
             metrics.cursor_max.set(max);
@@ -113,7 +104,7 @@ impl Store {
             max_times_sampled: config.max_times_sampled,
             selects: ring.selects(),
             watermark: log.watermark().clone(),
-            log: Mutex::new(Writing { log, disk_measured: started }),
+            log: Mutex::new(log),
             memory: RwLock::new(Memory { ring, state }),
             snapshots: Mutex::new(()),
             gate: Gate::new(limiter, waits.clone()),
@@ -132,7 +123,7 @@ impl Store {
     /// Notes that a writer has come, under the name that logs and `status` show, and returns the greatest sequence
     /// number of it that is durable: it goes on from there. [`Store::farewell`] when it goes.
     pub fn introduce(&self, writer: u64, name: &str) -> u64 {
-        let durable = self.writing().log.durable(writer);
+        let durable = self.log().durable(writer);
         self.gate.writer_came(writer, name, durable);
         self.metrics.writers.inc();
         durable
@@ -228,12 +219,12 @@ impl Store {
             return Ok(());
         }
         let wait = self.waits.begin("replay", format!("the disk takes {} segments", segments.len()));
-        let mut writing = self.writing();
-        let new = writing.log.append(segments)?;
+        let mut log = self.log();
+        let new = log.append(segments)?;
         drop(wait);
         let fresh: Vec<&Segment> =
             segments.iter().zip(new).filter_map(|(segment, new)| new.then_some(segment)).collect();
-        let state = writing.log.state();
+        let state = log.state();
         {
             let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
             for segment in &fresh {
@@ -252,10 +243,6 @@ impl Store {
         self.metrics.commit_segments.observe(fresh.len() as f64);
         self.metrics.append_seconds.observe(started.elapsed().as_secs_f64());
         self.show_limiter();
-        if writing.disk_measured.elapsed() >= MEASURE_EVERY {
-            writing.disk_measured = Instant::now();
-            self.metrics.disk_bytes.set(log::disk_bytes(&self.dir) as i64);
-        }
         Ok(())
     }
 
@@ -267,11 +254,11 @@ impl Store {
     /// [`StoreError::Io`]; the store itself goes on.
     pub fn snapshot(&self, to: &Path) -> Result<(Duration, ReplayCounters), StoreError> {
         let _one_at_a_time = self.snapshots.lock().unwrap_or_else(PoisonError::into_inner);
-        let writing = self.writing();
+        let log = self.log();
         let started = Instant::now();
-        let snapshot = writing.log.begin_snapshot(to);
-        let (state, held) = (writing.log.state(), self.len());
-        drop(writing);
+        let snapshot = log.begin_snapshot(to);
+        let (state, held) = (log.state(), self.len());
+        drop(log);
         let paused = started.elapsed();
         let snapshot = snapshot?;
         let counters = self.counters_of(state, snapshot.sampled(), held);
@@ -441,7 +428,7 @@ impl Store {
         self.metrics.cursor.set(self.gate.limiter().cursor());
     }
 
-    fn writing(&self) -> MutexGuard<'_, Writing> {
+    fn log(&self) -> MutexGuard<'_, Log> {
         // A log that panicked refuses all further appends by itself.
         self.log.lock().unwrap_or_else(PoisonError::into_inner)
     }

@@ -118,7 +118,7 @@ fn a_full_disk_does_not_hold_up_the_end_and_keeps_what_was_acknowledged() {
 
 fn source(replay: &Replay, batch: usize) -> RemoteSource {
     let options = RemoteOptions {
-        endpoint: replay.endpoint.clone(),
+        endpoint: (&replay.endpoint).into(),
         spec: replay.spec.clone(),
         sample: options(batch),
         name: "learner".to_owned(),

@@ -121,7 +121,7 @@ fn every_acknowledged_segment_survives_a_kill_under_load_and_none_is_stored_twic
 
 fn sampler(endpoint: &str, runtime: &tokio::runtime::Runtime) -> RemoteSource {
     let options = RemoteOptions {
-        endpoint: endpoint.to_owned(),
+        endpoint: endpoint.into(),
         spec: spec(STEPS),
         sample: common::options(32),
         name: "learner".to_owned(),

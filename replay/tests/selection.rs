@@ -77,7 +77,7 @@ fn waiting(replay: &Replay) -> String {
 
 fn source(replay: &Replay, batch: usize) -> RemoteSource {
     let options = RemoteOptions {
-        endpoint: replay.endpoint.clone(),
+        endpoint: (&replay.endpoint).into(),
         spec: replay.spec.clone(),
         sample: options(batch),
         name: "learner".to_owned(),
@@ -232,7 +232,7 @@ fn tables_of_one_service_know_nothing_of_each_other() {
     let described = runtime.block_on(describe_table(&endpoint, "queue")).unwrap();
     assert_eq!((described.size, described.tables), (64, vec!["default".to_owned(), "queue".to_owned()]));
     let options = RemoteOptions {
-        endpoint: endpoint.clone(),
+        endpoint: (&endpoint).into(),
         spec: get_up_spec(),
         sample: options(32),
         name: "learner".to_owned(),

@@ -7,6 +7,7 @@ use common::{Replay, config, eventually, options};
 use fixtures::{segment, spec};
 use getup_replay::{ItemSelector, MinibatchSource, RemoteOptions, ReplayConfig, SampleError, ShardedSource};
 use getup_telemetry::{Registry, Shutdown, Waits};
+use getup_transport::Endpoint;
 use std::time::Duration;
 use tokio::runtime::Runtime;
 
@@ -27,9 +28,9 @@ struct Learner {
 }
 
 fn learner(replays: &[&Replay]) -> Learner {
-    let endpoints: Vec<String> = replays.iter().map(|replay| replay.endpoint.clone()).collect();
+    let endpoints: Vec<Endpoint> = replays.iter().map(|replay| (&replay.endpoint).into()).collect();
     let options = RemoteOptions {
-        endpoint: String::new(),
+        endpoint: Endpoint::default(),
         table: String::new(),
         spec: spec(STEPS),
         sample: options(16),

@@ -24,7 +24,7 @@ fn local(replay: &Replay, options: SampleOptions) -> Result<Box<dyn MinibatchSou
 
 fn remote(replay: &Replay, sample: SampleOptions) -> Result<Box<dyn MinibatchSource>, SampleError> {
     let options = RemoteOptions {
-        endpoint: replay.endpoint.clone(),
+        endpoint: (&replay.endpoint).into(),
         spec: replay.spec.clone(),
         sample,
         name: "learner".to_owned(),
@@ -222,7 +222,7 @@ fn a_remote_source_waits_for_the_service_and_comes_back_after_its_restart_with_o
     let endpoint = bind("127.0.0.1:0").local_addr().unwrap().to_string();
 
     let options = RemoteOptions {
-        endpoint: endpoint.clone(),
+        endpoint: (&endpoint).into(),
         spec: spec(8),
         sample: options(32),
         name: "learner".to_owned(),

@@ -7,10 +7,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
-use getup_replay::{ReplayMetrics, Store, Tables, serve};
+use getup_replay::{ReplayMetrics, Store, Tables, limits, serve_at};
 
 use crate::config::{Config, NetworkConfig};
-use crate::role::{Role, RoleArgs, bind};
+use crate::role::{Role, RoleArgs};
 
 /// Run the replay: stores what actors push, durably, and serves minibatches to the learner.
 ///
@@ -40,7 +40,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         return tool.run();
     }
     let config = arguments.role.config.load()?;
-    let role = Role::new("replay", arguments.role.log_format)?;
+    let role = Role::new("replay", &config, arguments.role.log_format)?;
     let shard = Shard::choose(&config.network, arguments.shard)?;
     let dir = arguments.dir.unwrap_or_else(|| PathBuf::from("runs").join(&config.run).join(shard.folder()));
     role.run(start(&config, &role, &shard, dir, arguments.tables))
@@ -84,7 +84,7 @@ async fn start(
     dir: PathBuf,
     tables: Option<PathBuf>,
 ) -> Result<()> {
-    let listener = bind(&shard.address, "gRPC").await?;
+    let listener = role.bind_grpc(&shard.address).await?;
     role.serve_metrics(&config.network.replay_metrics).await?;
     std::fs::create_dir_all(&dir)?;
     let (spec, settings) = (config.run_spec()?, config.replay_config(shard.of));
@@ -105,7 +105,8 @@ async fn start(
         () = role.shutdown.wait() => return Ok(()),
     };
     drop(reading);
-    serve(listener, tables, role.shutdown.clone()).await?;
+    role.ready.set();
+    serve_at(role.port(limits()), listener, tables, role.shutdown.clone()).await?;
     tracing::info!("replay ended: everything acknowledged is stored");
     Ok(())
 }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail, ensure};
 use clap::{Subcommand, ValueEnum};
 use getup_replay::{DatasetId, Exported, Rewritten, Survey, export_minari, export_npz};
+use getup_transport::{Credentials, Endpoint};
 use serde_json::json;
 
 use crate::config::ConfigArgs;
@@ -249,14 +250,17 @@ fn dataset(output: Option<PathBuf>, id: Option<String>, run: &str) -> Result<(Pa
 
 #[tokio::main(flavor = "current_thread")]
 async fn snapshot(name: &str, table: &str, config: &ConfigArgs, json: bool) -> Result<()> {
-    for address in config.load()?.network.replays() {
-        snapshot_of(&address, name, table, json).await?;
+    let config = config.load()?;
+    let credentials = Credentials::load(&config.security)?;
+    for address in config.network.replays() {
+        snapshot_of(&Endpoint::new(&address, &credentials), name, table, json).await?;
     }
     Ok(())
 }
 
-async fn snapshot_of(address: &str, name: &str, table: &str, json: bool) -> Result<()> {
-    let taken = getup_replay::take_snapshot(address, table, name).await;
+async fn snapshot_of(endpoint: &Endpoint, name: &str, table: &str, json: bool) -> Result<()> {
+    let address = &endpoint.address;
+    let taken = getup_replay::take_snapshot(endpoint.clone(), table, name).await;
     let taken = taken.map_err(|status| anyhow::anyhow!("replay at {address}: {}", status.message()))?;
     let transitions = taken.counters.unwrap_or_default().transitions;
     if json {

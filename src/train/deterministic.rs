@@ -54,7 +54,7 @@ pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Sta
         identity: setup.identity,
         beta: setup.beta,
         diverged_folder: setup.diverged_folder,
-        metrics: ActorMetrics::new(&role.registry),
+        metrics: ActorMetrics::new(&role.registry, &config.actor.name),
     };
     let mut turns = Turns {
         evaluator: Evaluator::new(&config.task, config.control_limit(), config.evaluation.episodes)?,

@@ -1,11 +1,13 @@
-//! `GET /metrics` over HTTP.
+//! A role's HTTP port: `GET /metrics` for Prometheus, `/healthz` for whoever starts and stops containers.
 
 use std::io;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use axum::Router;
 use axum::extract::State;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use prometheus::{Registry, TEXT_FORMAT, TextEncoder};
@@ -16,13 +18,43 @@ use crate::Shutdown;
 /// How long a request that is under way at shutdown may take to end.
 const GRACE: Duration = Duration::from_secs(1);
 
-/// Serves `GET /metrics` in Prometheus' text format until shutdown; any other path is 404.
+/// Whether a role does its work: it does not while it reads back its store. Clones share it.
+#[derive(Clone, Debug, Default)]
+pub struct Ready(Arc<AtomicBool>);
+
+impl Ready {
+    /// From now on it does.
+    pub fn set(&self) {
+        self.0.store(true, Ordering::Release);
+    }
+}
+
+/// Says by a request's headers whether it may read `/metrics`.
+pub type Guard = Arc<dyn Fn(&HeaderMap) -> bool + Send + Sync>;
+
+/// What the port shows.
+#[derive(Clone)]
+pub struct Shown {
+    /// At `/metrics`.
+    pub registry: Registry,
+    /// At `/healthz`: 200 once the role does its work, 503 before and during its end.
+    pub ready: Ready,
+    /// Who may read `/metrics`.
+    pub guard: Guard,
+}
+
+/// Serves `GET /metrics` in Prometheus' text format, `/healthz` (the role does its work) and `/livez` (the process answers)
+/// until shutdown; any other path is 404.
 ///
 /// # Errors
 /// When the listener fails for good.
-pub async fn serve_http(listener: TcpListener, registry: Registry, shutdown: Shutdown) -> io::Result<()> {
-    let router = Router::new().route("/metrics", get(metrics)).with_state(registry);
+pub async fn serve_http(listener: TcpListener, shown: Shown, shutdown: Shutdown) -> io::Result<()> {
     let ended = shutdown.clone();
+    let router = Router::new()
+        .route("/metrics", get(metrics))
+        .route("/healthz", get(health))
+        .route("/livez", get(|| async { "ok\n" }))
+        .with_state((shown, shutdown.clone()));
     let server = axum::serve(listener, router).with_graceful_shutdown(async move { ended.wait().await });
     tokio::select! {
         result = server => result,
@@ -31,9 +63,23 @@ pub async fn serve_http(listener: TcpListener, registry: Registry, shutdown: Shu
     }
 }
 
-async fn metrics(State(registry): State<Registry>) -> Response {
-    match TextEncoder::new().encode_to_string(&registry.gather()) {
+async fn metrics(State((shown, _)): State<(Shown, Shutdown)>, headers: HeaderMap) -> Response {
+    if !(shown.guard)(&headers) {
+        let how = "a token is needed: send `authorization: Bearer TOKEN` with the one in security.metrics_token_file\n";
+        return (StatusCode::UNAUTHORIZED, how).into_response();
+    }
+    match TextEncoder::new().encode_to_string(&shown.registry.gather()) {
         Ok(text) => ([(header::CONTENT_TYPE, TEXT_FORMAT)], text).into_response(),
         Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
+    }
+}
+
+async fn health(State((shown, shutdown)): State<(Shown, Shutdown)>) -> Response {
+    if shutdown.is_triggered() {
+        (StatusCode::SERVICE_UNAVAILABLE, "ending\n").into_response()
+    } else if shown.ready.0.load(Ordering::Acquire) {
+        "ok\n".into_response()
+    } else {
+        (StatusCode::SERVICE_UNAVAILABLE, "starting\n").into_response()
     }
 }

@@ -3,8 +3,8 @@
 //! | module | what it gives |
 //! | --- | --- |
 //! | [`logging`] | [`init_logging`]: structured logs, pretty for people or JSON for machines |
-//! | [`metrics`] | [`build_info`], and the [`Registry`] that every role's metrics register in |
-//! | [`http`] | [`serve_http`]: `GET /metrics` in Prometheus' text format |
+//! | [`metrics`] | [`registry`], which every role's metrics register in, and [`build_info`] |
+//! | [`http`] | [`serve_http`]: `/metrics` for Prometheus, `/healthz` for whoever starts containers |
 //! | [`health`](mod@health) | [`health()`]: the gRPC health service |
 //! | [`shutdown`] | [`Shutdown`]: the one thing that everything awaits to end |
 //! | [`waits`] | [`Waits`]: every wait has a reason that logs, metrics and `getup status` show |
@@ -20,9 +20,9 @@ pub mod waits;
 
 pub use backoff::Backoff;
 pub use health::health;
-pub use http::serve_http;
+pub use http::{Ready, Shown, serve_http};
 pub use logging::{LogFormat, LoggingError, init_logging};
-pub use metrics::build_info;
+pub use metrics::{build_info, registry};
 pub use prometheus::{self, Registry};
 pub use shutdown::Shutdown;
 pub use waits::{Wait, WaitGuard, Waits};

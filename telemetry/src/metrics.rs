@@ -3,7 +3,20 @@
 //! Each role has a struct of its own metrics, made once from the process's [`Registry`]. Names begin with
 //! `getup_<role>_` and end in their unit, or in `_total` where they only count up.
 
+use prometheus::process_collector::ProcessCollector;
 use prometheus::{IntGauge, Opts, Registry};
+
+/// A registry whose metrics all carry the run's name as the label `run`, with those of the process itself: its memory,
+/// its processor time, its open files.
+///
+/// # Panics
+/// Never: the names are well-formed, and the registry is new.
+pub fn registry(run: &str) -> Registry {
+    let labels = [("run".to_owned(), run.to_owned())].into();
+    let registry = Registry::new_custom(None, Some(labels)).expect("a label is well-formed");
+    registry.register(Box::new(ProcessCollector::for_self())).expect("the registry is new");
+    registry
+}
 
 /// Registers `getup_build_info{version,role}`, which is 1.
 ///

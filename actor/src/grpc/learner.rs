@@ -6,10 +6,10 @@ use getup_proto::v1::learner_client::LearnerClient;
 use getup_proto::v1::{self, SubscribeRequest};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec};
 use getup_telemetry::{Backoff, WaitGuard, Waits};
-use tonic::transport::Channel;
+use getup_transport::{AddressError, Channel, ChannelOptions, Endpoint};
 use tonic::{Code, Status};
 
-use super::{AddressError, PATIENCE, channel, link_error};
+use super::{PATIENCE, link_error};
 use crate::link::{
     EpisodeResult, Heartbeat, LearnerLink, Lease, LinkError, PolicySlot, PolicyUpdate, Reported,
 };
@@ -24,16 +24,22 @@ pub struct GrpcLearner {
 }
 
 impl GrpcLearner {
-    /// A link of the actor `name` to the learner at `address`, such as `http://learner:7500`. It connects when it is
+    /// A link of the actor `name` to the learner at `endpoint`. It connects when it is
     /// first used.
     ///
     /// # Errors
     /// [`AddressError`] when the address is none.
-    pub fn new(address: &str, spec: RunSpec, name: &str, waits: Waits) -> Result<Self, AddressError> {
-        let client = LearnerClient::new(channel(address)?)
+    pub fn new(
+        endpoint: impl Into<Endpoint>,
+        spec: RunSpec,
+        name: &str,
+        waits: Waits,
+    ) -> Result<Self, AddressError> {
+        let endpoint = endpoint.into();
+        let client = LearnerClient::new(endpoint.channel(ChannelOptions::default())?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
-        let peer = format!("learner at {address}");
+        let peer = format!("learner at {}", endpoint.address);
         Ok(Self { client, peer, spec, name: name.to_owned(), waits })
     }
 

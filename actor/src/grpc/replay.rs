@@ -5,12 +5,12 @@ use getup_proto::v1::replay_client::ReplayClient;
 use getup_proto::v1::{AppendHello, AppendReply, AppendRequest};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment};
 use getup_telemetry::{Backoff, WaitGuard, Waits};
+use getup_transport::{AddressError, Channel, ChannelOptions, Endpoint};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::UnboundedReceiverStream;
-use tonic::transport::Channel;
 use tonic::{Status, Streaming};
 
-use super::{AddressError, channel, link_error};
+use super::link_error;
 use crate::identity::Identity;
 use crate::link::{LinkError, SegmentWriter};
 
@@ -35,15 +35,21 @@ struct AppendStream {
 }
 
 impl GrpcReplay {
-    /// A writer to the replay at `address`, such as `http://replay:7400`. It connects when it first appends.
+    /// A writer to the replay at `endpoint`. It connects when it first appends.
     ///
     /// # Errors
     /// [`AddressError`] when the address is none.
-    pub fn new(address: &str, spec: RunSpec, identity: Identity, waits: Waits) -> Result<Self, AddressError> {
-        let client = ReplayClient::new(channel(address)?)
+    pub fn new(
+        endpoint: impl Into<Endpoint>,
+        spec: RunSpec,
+        identity: Identity,
+        waits: Waits,
+    ) -> Result<Self, AddressError> {
+        let endpoint = endpoint.into();
+        let client = ReplayClient::new(endpoint.channel(ChannelOptions::default())?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
-        let peer = format!("replay at {address}");
+        let peer = format!("replay at {}", endpoint.address);
         Ok(Self { client, peer, spec, identity, waits, backoff: Backoff::new(), stream: None })
     }
 

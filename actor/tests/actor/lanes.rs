@@ -21,7 +21,7 @@ fn settings(setup: &ActorSetup) -> LaneSettings {
         identity: setup.identity.clone(),
         beta: setup.beta,
         diverged_folder: setup.diverged_folder.clone(),
-        metrics: ActorMetrics::new(&Registry::new()),
+        metrics: ActorMetrics::new(&Registry::new(), "actor"),
     }
 }
 

@@ -100,18 +100,23 @@ async fn an_actor_waits_for_a_policy_plays_evaluates_and_ends_with_its_queue_emp
     let (registry, waits) = (actor.registry.clone(), actor.waits.clone());
     assert!(actor.end().await < Duration::from_secs(4));
     assert!(waits.current().is_empty());
+    let leaves = |state: &mut crate::support::learner::State| {
+        state.heartbeats.last().map(|beat| (beat.leaving, beat.idle))
+    };
+    assert_eq!(broadcast.with(leaves), Some((true, false)), "its last heartbeat says that it ends");
     let stored = store.with(|state| state.segments.clone());
     let sequences: Vec<u64> = stored.iter().map(|segment| segment.sequence).collect();
     assert_eq!(sequences, (1..=stored.len() as u64).collect::<Vec<_>>());
     let lanes: std::collections::BTreeSet<u32> = stored.iter().map(|segment| segment.lane).collect();
     assert_eq!(lanes.len(), 4);
     let text = getup_telemetry::prometheus::TextEncoder::new().encode_to_string(&registry.gather()).unwrap();
-    for line in [
-        "getup_actor_unacknowledged_segments 0",
-        "getup_actor_evaluations_total 1",
-        "getup_actor_diverged_episodes_total 0",
-        &format!("getup_actor_segments_acknowledged_total {}", stored.len()),
+    for (name, value) in [
+        ("unacknowledged_segments", 0),
+        ("evaluations_total", 1),
+        ("diverged_episodes_total", 0),
+        ("segments_acknowledged_total", stored.len()),
     ] {
+        let line = format!("getup_actor_{name}{{actor=\"actor-1\"}} {value}");
         assert!(text.lines().any(|found| found == line), "{line} in\n{text}");
     }
 }

@@ -152,6 +152,17 @@ impl CpuUpdate {
         run(&self.pool, &mut pieces, |piece| piece.step(step, 0.0));
     }
 
+    /// Euclidean norms of the last update's gradients: of all critics, of the actor.
+    pub(crate) fn gradient_norms(&self) -> [f64; 2] {
+        // A step leaves the sum of all workers' gradients with the first.
+        let norm = |gradient: fn(&Worker) -> &[f32]| {
+            let squares =
+                |worker| gradient(worker).iter().map(|&value| f64::from(value).powi(2)).sum::<f64>();
+            self.workers.first().map_or(0.0, squares).sqrt()
+        };
+        [norm(|worker| &worker.critics_gradient), norm(|worker| &worker.actor_gradient)]
+    }
+
     /// The matrix products of one update on `batch` transitions and nothing else: its limit on this processor.
     pub(crate) fn multiply(&mut self, batch: usize) {
         self.lay_out(batch);

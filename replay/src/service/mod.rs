@@ -16,8 +16,9 @@ use append::AppendStream;
 use committer::Job;
 use getup_proto::v1::replay_server::{Replay, ReplayServer};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, SpecError, v1};
-use getup_telemetry::Shutdown;
 use getup_telemetry::health::{ServingStatus, health};
+use getup_telemetry::{Registry, Shutdown};
+use getup_transport::{Credentials, Limits, Metrics, Server, Window};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -25,15 +26,13 @@ use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::server::TcpIncoming;
+use tonic::service::Routes;
 use tonic::{Request, Response, Status, Streaming};
 
 /// How long streams may take to end after the shutdown has begun.
 const GRACE: Duration = Duration::from_secs(3);
 /// How long a client may take to say hello.
 const HELLO_PATIENCE: Duration = Duration::from_secs(10);
-/// A peer that does not answer pings for this long is gone.
-const PING_EVERY: Duration = Duration::from_secs(10);
 /// Bytes of a stream that may be on their way to a server that is not reading: some tens of segments.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
 /// Where snapshots go, in the store's folder.
@@ -57,12 +56,32 @@ pub enum ServeError {
     Panicked(#[from] tokio::task::JoinError),
 }
 
+/// As [`serve_at`], at a port that is open to all.
+///
+/// # Errors
+/// As [`serve_at`].
+pub async fn serve(
+    listener: TcpListener,
+    tables: impl Into<Tables>,
+    shutdown: Shutdown,
+) -> Result<(), ServeError> {
+    let port = Server::new(Credentials::default(), limits(), Metrics::new(&Registry::new()));
+    serve_at(port, listener, tables, shutdown).await
+}
+
+/// What the service's port lets its peers take.
+pub fn limits() -> Limits {
+    let window = Window::Fixed { stream: STREAM_WINDOW_BYTES, connection: 4 * STREAM_WINDOW_BYTES };
+    Limits { window, ..Limits::default() }
+}
+
 /// Serves the tables and the gRPC health service until `shutdown`: then takes no more segments, acknowledges those
 /// that came, ends all streams with UNAVAILABLE, and returns. A store alone is the table `default`.
 ///
 /// # Errors
 /// [`ServeError`], when a store or the network fails.
-pub async fn serve(
+pub async fn serve_at(
+    port: Server,
     listener: TcpListener,
     tables: impl Into<Tables>,
     shutdown: Shutdown,
@@ -86,14 +105,7 @@ pub async fn serve(
             reporter.set_service_status("", ServingStatus::NotServing).await;
         }
     };
-    let serving = tonic::transport::Server::builder()
-        .http2_keepalive_interval(Some(PING_EVERY))
-        .http2_keepalive_timeout(Some(PING_EVERY))
-        .initial_stream_window_size(STREAM_WINDOW_BYTES)
-        .initial_connection_window_size(4 * STREAM_WINDOW_BYTES)
-        .add_service(health)
-        .add_service(service)
-        .serve_with_incoming_shutdown(TcpIncoming::from(listener).with_nodelay(Some(true)), drain);
+    let serving = port.serve(listener, Routes::new(health).add_service(service), drain);
     let out_of_patience = async {
         shutdown.wait().await;
         tokio::time::sleep(GRACE).await;

@@ -1,0 +1,53 @@
+//! `getup certs`: certificates for a cluster that has no authority of its own.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result};
+use getup_transport::{Issued, generate_token, make_authority};
+
+/// Make an authority and a certificate that all roles of a cluster share, for mutual TLS.
+///
+/// DIR gets ca.pem, ca.key, peer.pem and peer.key. Give the roles `security.ca=DIR/ca.pem`,
+/// `security.certificate=DIR/peer.pem` and `security.key=DIR/peer.key`, and keep ca.key to yourself. Called again it
+/// renews peer.pem and keeps the authority; running roles take the new files up by themselves.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    /// Where the files go.
+    dir: PathBuf,
+    /// A host name or address by which a role is reached, such as replay; may be repeated. localhost is always there.
+    #[arg(long = "name", value_name = "HOST")]
+    names: Vec<String>,
+    /// Leave a certificate that is valid for these names, and for another month, as it is.
+    #[arg(long)]
+    if_missing: bool,
+    /// Also make DIR/token, a secret for security.token_file, where there is none.
+    #[arg(long)]
+    token: bool,
+}
+
+pub(crate) fn run(arguments: Args) -> Result<()> {
+    let dir = &arguments.dir;
+    let issued = make_authority(dir, &arguments.names, arguments.if_missing)?;
+    let shown = dir.display();
+    println!(
+        "{}",
+        match issued {
+            Issued::Nothing => format!("{shown}/peer.pem is valid: nothing to do"),
+            Issued::Peer => format!("{shown}/peer.pem is new, from the authority that was there"),
+            Issued::AuthorityAndPeer => format!("{shown}/ca.pem and {shown}/peer.pem are new"),
+        }
+    );
+    let token = dir.join("token");
+    if arguments.token && !token.exists() {
+        write_secret(&token).with_context(|| format!("cannot write {}", token.display()))?;
+        println!("{} is new", token.display());
+    }
+    Ok(())
+}
+
+fn write_secret(path: &std::path::Path) -> std::io::Result<()> {
+    use std::io::Write;
+    use std::os::unix::fs::OpenOptionsExt;
+    let mut file = std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
+    writeln!(file, "{}", generate_token())
+}

@@ -1,0 +1,63 @@
+//! `getup health`: what a container's health check asks.
+
+use std::io::{Read, Write};
+use std::net::{TcpStream, ToSocketAddrs};
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail, ensure};
+use clap::ValueEnum;
+
+use crate::config::ConfigArgs;
+
+const PATIENCE: Duration = Duration::from_secs(3);
+
+/// Ask a role on this machine whether it does its work: ends with 0 if it does.
+///
+/// It asks the role's own HTTP port, network.ROLE_metrics, which also serves /metrics.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    /// Whom to ask.
+    role: Asked,
+    #[command(flatten)]
+    config: ConfigArgs,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Asked {
+    Replay,
+    Learner,
+    Actor,
+}
+
+pub(crate) fn run(arguments: Args) -> Result<()> {
+    let network = arguments.config.load()?.network;
+    let (name, address) = match arguments.role {
+        Asked::Replay => ("replay", network.replay_metrics),
+        Asked::Learner => ("learner", network.learner_metrics),
+        Asked::Actor => ("actor", network.actor_metrics),
+    };
+    ensure!(
+        !address.ends_with(":0"),
+        "network.{name}_metrics = {address}: a role that takes any port cannot be found; give it one, there and here"
+    );
+    // Who listens everywhere is here too.
+    let address = address.replace("0.0.0.0:", "127.0.0.1:").replace("[::]:", "[::1]:");
+    let answer = ask(&address).with_context(|| format!("the {name} does not answer at {address}"))?;
+    let (head, body) = answer.split_once("\r\n\r\n").unwrap_or((&answer, ""));
+    if head.split(' ').nth(1) != Some("200") {
+        bail!("the {name} is there and does not work yet or any more: {}", body.trim());
+    }
+    println!("{}", body.trim());
+    Ok(())
+}
+
+fn ask(address: &str) -> Result<String> {
+    let resolved = address.to_socket_addrs()?.next().context("the name has no address")?;
+    let mut stream = TcpStream::connect_timeout(&resolved, PATIENCE)?;
+    stream.set_read_timeout(Some(PATIENCE))?;
+    write!(stream, "GET /healthz HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n")?;
+    let mut answer = String::new();
+    // More than this no role answers.
+    stream.take(1 << 16).read_to_string(&mut answer)?;
+    Ok(answer)
+}
