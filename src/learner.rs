@@ -93,9 +93,9 @@ async fn serve(
     let shutdown = role.shutdown.clone();
     let result = tokio::task::spawn_blocking(move || trainer.run(&mut source, &shutdown)).await?;
     match &result {
-        Err(error @ TrainError::Loss(_)) => {
+        Err(TrainError::Loss(loss)) => {
             // Actors go on by the last good policy, and whoever looks sees why training does not: until it is restarted.
-            tracing::error!("{error}");
+            tracing::error!("training stopped: {loss}");
             role.shutdown.wait().await;
         }
         Ok(Ending::Shutdown) | Err(_) => {}

@@ -51,10 +51,10 @@ pub enum TrainError {
     #[error(transparent)]
     Model(#[from] getup_policy::ModelError),
     /// The loss.
-    #[error("training stopped: {0}")]
+    #[error("training stopped")]
     Loss(#[from] NonFiniteLoss),
     /// The replay.
-    #[error("cannot sample from the replay: {0}")]
+    #[error("cannot sample from the replay")]
     Sample(#[from] SampleError),
     /// A minibatch lacks a column.
     #[error(

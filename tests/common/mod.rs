@@ -161,14 +161,20 @@ pub(crate) fn free_address() -> String {
 
 /// The text of `/metrics`; none where nobody answers.
 pub(crate) fn scrape(address: &str) -> Option<String> {
+    http_get(address, "/metrics")
+}
+
+/// What is at this path; none where nobody answers with 200.
+pub(crate) fn http_get(address: &str, path: &str) -> Option<String> {
     let mut stream = TcpStream::connect(address).ok()?;
     stream.set_read_timeout(Some(Duration::from_secs(5))).ok()?;
-    let request = format!("GET /metrics HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
+    // HTTP/1.0: the body comes in one piece.
+    let request = format!("GET {path} HTTP/1.0\r\nHost: {address}\r\n\r\n");
     stream.write_all(request.as_bytes()).ok()?;
     let mut response = String::new();
     stream.read_to_string(&mut response).ok()?;
     let (head, body) = response.split_once("\r\n\r\n")?;
-    head.starts_with("HTTP/1.1 200").then(|| body.to_owned())
+    head.split(' ').nth(1).is_some_and(|code| code == "200").then(|| body.to_owned())
 }
 
 /// The first sample of this name in `/metrics`.
