@@ -5,6 +5,7 @@
 
 mod actor;
 mod certs;
+mod chaos;
 mod config;
 mod doctor;
 mod evaluate;
@@ -55,6 +56,7 @@ enum Command {
     Falls(falls::Args),
     Doctor(doctor::Args),
     Certs(certs::Args),
+    Chaos(chaos::Args),
     Health(health::Args),
     Status(status::Args),
 }
@@ -74,6 +76,7 @@ fn main() -> ExitCode {
         Command::Falls(arguments) => falls::run(arguments),
         Command::Doctor(arguments) => doctor::run(arguments),
         Command::Certs(arguments) => certs::run(arguments),
+        Command::Chaos(arguments) => chaos::run(arguments),
         Command::Health(arguments) => health::run(arguments),
         Command::Status(arguments) => status::run(arguments),
     };

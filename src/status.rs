@@ -141,6 +141,8 @@ fn replay_json(reply: &v1::DescribeReply) -> serde_json::Value {
     json!({
         "size": reply.size, "capacity": reply.capacity,
         "memory_bytes": reply.memory_bytes, "disk_bytes": reply.disk_bytes,
+        // A string: it has more digits than a number in JSON is sure to keep.
+        "store": counters.store.to_string(),
         "env_steps": counters.env_steps, "transitions": counters.transitions,
         "episodes": counters.episodes, "sampled": counters.sampled,
         "waiting": limiter.waiting,

@@ -36,11 +36,15 @@ enum Command {
         #[arg(last = true)]
         args: Vec<String>,
     },
-    /// Set up what is missing and run the tests in their short form.
+    /// Set up what is missing and run the tests in their short form; where a Docker engine is present also on a cluster of
+    /// containers, with one fault.
     Test {
-        /// The long forms too: soaks and hundreds of kills.
+        /// The long forms too: soaks, hundreds of kills, every fault of the cluster.
         #[arg(long)]
         full: bool,
+        /// Only the cluster, with every fault.
+        #[arg(long, conflicts_with = "full")]
+        cluster: bool,
     },
     /// Format, clippy and documentation, without a warning.
     Check,
@@ -83,10 +87,13 @@ fn main() -> Result<()> {
             native::set_up(false)?;
             tasks::train(&args)
         }
-        Command::Test { full } => {
+        Command::Test { full, cluster } => {
             native::set_up(false)?;
             prerequisites::install_debian_packages()?;
-            tasks::test(full)
+            if !cluster {
+                tasks::test(full)?;
+            }
+            tasks::test_cluster(full || cluster)
         }
         Command::Check => {
             native::set_up(false)?;

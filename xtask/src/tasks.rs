@@ -46,6 +46,21 @@ pub(crate) fn test(full: bool) -> Result<()> {
     run(&mut command)
 }
 
+/// `deploy/test`: containers of this build, their metrics, and faults; where there is a Docker engine.
+pub(crate) fn test_cluster(full: bool) -> Result<()> {
+    let works = |arguments: &[&str]| {
+        let (program, arguments) = arguments.split_first().expect("a program");
+        Command::new(program).args(arguments).output().is_ok_and(|output| output.status.success())
+    };
+    if !(works(&["test", "-O", "/"]) && works(&["docker", "info"]) && works(&["docker-compose", "version"])) {
+        println!("skipped: the cluster of containers needs root, a Docker engine and docker-compose");
+        return Ok(());
+    }
+    let getup = build()?;
+    let mut command = Command::new(root().join("deploy/test"));
+    run(command.args(full.then_some("--full")).env("GETUP", getup))
+}
+
 /// Format, clippy (with and without the learner) and documentation, all without a warning.
 pub(crate) fn check() -> Result<()> {
     run(cargo().args(["fmt", "--all", "--check"]))?;

@@ -1,0 +1,326 @@
+//! `getup chaos`: a plan of faults against a running cluster, and whether it heals.
+
+use std::path::PathBuf;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail, ensure};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+/// How often a cluster is asked how it is.
+const TICK: Duration = Duration::from_millis(500);
+/// An actor that was heard from more recently takes part.
+const HEARD_SECONDS: f64 = 5.0;
+
+/// Break a running cluster by a plan, fault by fault, and see it heal.
+///
+/// The plan is a TOML file. `prelude` is shell code put before every command, `observe` a command that prints `getup
+/// status --json` of the cluster. Each `[[fault]]` has a `name`, a command `inject`, perhaps a command `heal`, `hold`
+/// (seconds between the two) and `within` (seconds in which the cluster must be well again). It is well when the learner
+/// makes updates, the replay stores env steps, and as many actors are heard as before. And it must never have lost
+/// anything: what the replays hold, the curriculum's stage, and the policies' versions only grow.
+///
+/// deploy/chaos.toml is the plan for a cluster of docker compose.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    /// The plan.
+    #[arg(long, value_name = "FILE")]
+    plan: PathBuf,
+    /// Only faults whose name contains this; may be repeated.
+    #[arg(long, value_name = "TEXT")]
+    only: Vec<String>,
+    /// List the faults and break nothing.
+    #[arg(long)]
+    list: bool,
+    /// Yes, break the cluster: without it nothing is done.
+    #[arg(long)]
+    yes: bool,
+    /// One JSON object a fault on stdout.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Plan {
+    #[serde(default)]
+    prelude: String,
+    observe: String,
+    fault: Vec<Fault>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Fault {
+    name: String,
+    inject: String,
+    #[serde(default)]
+    heal: String,
+    #[serde(default)]
+    hold: f64,
+    #[serde(default = "default_within")]
+    within: f64,
+}
+
+fn default_within() -> f64 {
+    10.0
+}
+
+/// How a fault ended.
+#[derive(Serialize)]
+struct Outcome<'a> {
+    fault: &'a str,
+    passed: bool,
+    /// From the end of the fault until the cluster was well.
+    recovered_seconds: Option<f64>,
+    problem: Option<String>,
+}
+
+pub(crate) fn run(arguments: Args) -> Result<()> {
+    let shown = arguments.plan.display();
+    let text =
+        std::fs::read_to_string(&arguments.plan).with_context(|| format!("cannot read the plan {shown}"))?;
+    let plan: Plan = toml::from_str(&text).with_context(|| format!("{shown} is no plan"))?;
+    let chosen = |fault: &&Fault| {
+        arguments.only.is_empty() || arguments.only.iter().any(|text| fault.name.contains(text.as_str()))
+    };
+    let faults: Vec<&Fault> = plan.fault.iter().filter(chosen).collect();
+    if faults.is_empty() {
+        let names: Vec<&str> = plan.fault.iter().map(|fault| fault.name.as_str()).collect();
+        bail!("--only: no fault of {shown} has such a name; there are: {}", names.join(", "));
+    }
+    if arguments.list {
+        faults.iter().for_each(|fault| println!("{}", fault.name));
+        return Ok(());
+    }
+    ensure!(
+        arguments.yes,
+        "this breaks the cluster {} times, on purpose: say --yes to do it, --list to see how",
+        faults.len()
+    );
+    let mut failed = 0;
+    for fault in faults {
+        let outcome = plan.try_fault(fault);
+        failed += usize::from(!outcome.passed);
+        if arguments.json {
+            println!("{}", serde_json::to_string(&outcome)?);
+        } else {
+            let recovered = outcome.recovered_seconds;
+            let recovered =
+                recovered.map_or_else(String::new, |seconds| format!(", well again after {seconds:.1} s"));
+            let problem = outcome.problem.map_or_else(String::new, |problem| format!(": {problem}"));
+            println!("{} {}{recovered}{problem}", if outcome.passed { "pass" } else { "FAIL" }, fault.name);
+        }
+    }
+    ensure!(failed == 0, "the cluster did not come through {failed} of its faults");
+    Ok(())
+}
+
+impl Plan {
+    fn try_fault<'a>(&self, fault: &'a Fault) -> Outcome<'a> {
+        let (recovered, problem) = match self.break_and_watch(fault) {
+            Ok(recovered) if recovered.as_secs_f64() <= fault.within => (Some(recovered), None),
+            Ok(recovered) => (Some(recovered), Some(format!("it may take {} s", fault.within))),
+            Err(error) => (None, Some(format!("{error:#}"))),
+        };
+        Outcome {
+            fault: &fault.name,
+            passed: problem.is_none(),
+            recovered_seconds: recovered.map(|time| time.as_secs_f64()),
+            problem,
+        }
+    }
+
+    /// From the end of the fault until the cluster is well.
+    fn break_and_watch(&self, fault: &Fault) -> Result<Duration> {
+        // Whatever was broken before must be well, or this fault would be blamed for it.
+        let patience = Duration::from_secs(60);
+        let before = self.wait_until_well(None, Instant::now(), patience).context("before the fault")?.0;
+        self.shell(&fault.inject).context("inject")?;
+        std::thread::sleep(Duration::from_secs_f64(fault.hold));
+        if !fault.heal.is_empty() {
+            self.shell(&fault.heal).context("heal")?;
+        }
+        // Later than it may, it is still worth knowing when.
+        let patience = Duration::from_secs_f64(fault.within + 60.0);
+        Ok(self.wait_until_well(Some(&before), Instant::now(), patience)?.1)
+    }
+
+    /// Watches until the cluster works as before, and that it lost nothing on the way.
+    fn wait_until_well(
+        &self,
+        before: Option<&Health>,
+        since: Instant,
+        patience: Duration,
+    ) -> Result<(Health, Duration)> {
+        let mut first: Option<Health> = None;
+        let mut why = "nobody answers".to_owned();
+        while since.elapsed() < patience {
+            match self.observe() {
+                Ok(now) => {
+                    if let Some(before) = before {
+                        now.check_kept(before)?;
+                    }
+                    let begun = first.get_or_insert_with(|| now.clone());
+                    match now.what_is_missing(begun, before) {
+                        None => return Ok((now, since.elapsed())),
+                        Some(missing) => why = missing,
+                    }
+                    // A learner that started again counts its updates from its checkpoint.
+                    if now.version.0 != begun.version.0 {
+                        first = Some(now);
+                    }
+                }
+                Err(error) => why = format!("{error:#}"),
+            }
+            std::thread::sleep(TICK);
+        }
+        bail!("not well after {:.0} s: {why}", patience.as_secs_f64())
+    }
+
+    fn observe(&self) -> Result<Health> {
+        let text = self.shell(&self.observe)?;
+        let status: Value =
+            serde_json::from_str(text.trim()).with_context(|| format!("observe printed {text:?}"))?;
+        Health::of(&status)
+    }
+
+    fn shell(&self, command: &str) -> Result<String> {
+        let script = format!("{}\n{command}", self.prelude);
+        let output = Command::new("bash").args(["-ec", &script]).output().context("cannot start bash")?;
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        ensure!(output.status.success(), "{} ({})", stderr.trim(), output.status);
+        Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+    }
+}
+
+/// What must grow, and who is there.
+#[derive(Clone, Debug)]
+struct Health {
+    /// Of each replay: its store's name, and the transitions ever stored.
+    stores: Vec<(String, u64)>,
+    env_steps: u64,
+    updates: u64,
+    stage: u64,
+    /// Learner's start, policy's counter.
+    version: (u64, u64),
+    actors: usize,
+    finished: bool,
+}
+
+impl Health {
+    /// Reads what `getup status --json` says.
+    fn of(status: &Value) -> Result<Self> {
+        let replays = match &status["replay"] {
+            Value::Array(several) => several.iter().collect(),
+            one => vec![one],
+        };
+        let mut stores = Vec::new();
+        let mut env_steps = 0;
+        for replay in replays {
+            if let Some(error) = replay["error"].as_str() {
+                bail!("replay: {error}");
+            }
+            let store = replay["store"].as_str().context("a replay without a store")?.to_owned();
+            stores.push((store, replay["transitions"].as_u64().unwrap_or(0)));
+            env_steps += replay["env_steps"].as_u64().unwrap_or(0);
+        }
+        let learner = &status["learner"];
+        if let Some(error) = learner["error"].as_str() {
+            bail!("learner: {error}");
+        }
+        let version = learner["version"].as_str().and_then(|version| version.split_once('.'));
+        let (incarnation, counter) = version.context("a learner without a policy")?;
+        let heard =
+            |actor: &&Value| actor["silent_seconds"].as_f64().is_some_and(|silent| silent < HEARD_SECONDS);
+        Ok(Self {
+            stores,
+            env_steps,
+            updates: learner["updates"].as_u64().unwrap_or(0),
+            stage: learner["stage"].as_u64().unwrap_or(0),
+            version: (incarnation.parse()?, counter.parse()?),
+            actors: learner["actors"].as_array().map_or(0, |actors| actors.iter().filter(heard).count()),
+            finished: learner["state"] == "finished",
+        })
+    }
+
+    /// Nothing acknowledged may be gone, and the curriculum never goes back.
+    fn check_kept(&self, before: &Self) -> Result<()> {
+        for (old, new) in before.stores.iter().zip(&self.stores) {
+            ensure!(old.0 == new.0, "replay lost its store {}: it has another, {}", old.0, new.0);
+            ensure!(new.1 >= old.1, "replay lost transitions: it had {}, it has {}", old.1, new.1);
+        }
+        ensure!(
+            self.stage >= before.stage,
+            "the curriculum went back from stage {} to {}",
+            before.stage,
+            self.stage
+        );
+        ensure!(
+            self.version >= before.version,
+            "the policies went back from {:?} to {:?}",
+            before.version,
+            self.version
+        );
+        Ok(())
+    }
+
+    /// Why it is not well: since `begun` all must have moved, and as many actors as `before` must be there.
+    fn what_is_missing(&self, begun: &Self, before: Option<&Self>) -> Option<String> {
+        let wanted = before.map_or(1, |before| before.actors);
+        if self.actors < wanted {
+            return Some(format!("{} of {wanted} actors are heard", self.actors));
+        }
+        if self.finished {
+            return None;
+        }
+        if self.env_steps <= begun.env_steps {
+            return Some(format!("no env step since {}", begun.env_steps));
+        }
+        (self.updates <= begun.updates).then(|| format!("no update since {}", begun.updates))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn health(env_steps: u64, updates: u64, actors: &[f64]) -> Health {
+        let actors: Vec<Value> = actors.iter().map(|silent| json!({"silent_seconds": silent})).collect();
+        Health::of(&json!({
+            "replay": {"store": "a", "transitions": env_steps, "env_steps": env_steps},
+            "learner": {"version": "2.7", "updates": updates, "stage": 1, "state": "training", "actors": actors},
+        }))
+        .unwrap()
+    }
+
+    #[test]
+    fn a_cluster_is_well_when_all_moves_and_all_are_there() {
+        let before = health(100, 10, &[0.1, 0.2]);
+        let missing = |now: Health| now.what_is_missing(&before, Some(&before));
+        assert_eq!(missing(health(101, 11, &[0.1, 0.2])), None);
+        assert!(missing(health(101, 10, &[0.1, 0.2])).unwrap().contains("no update"));
+        assert!(missing(health(100, 11, &[0.1, 0.2])).unwrap().contains("no env step"));
+        assert!(missing(health(101, 11, &[0.1, 30.0])).unwrap().contains("1 of 2 actors"));
+    }
+
+    #[test]
+    fn what_was_acknowledged_or_passed_is_never_gone() {
+        let before = health(100, 10, &[0.1]);
+        assert!(
+            health(100, 3, &[]).check_kept(&before).is_ok(),
+            "updates since the checkpoint are made again"
+        );
+        assert!(
+            health(99, 11, &[0.1]).check_kept(&before).unwrap_err().to_string().contains("lost transitions")
+        );
+        let back = Health { stage: 0, ..before.clone() };
+        assert!(back.check_kept(&before).unwrap_err().to_string().contains("went back from stage 1 to 0"));
+        let other = Health { stores: vec![("b".into(), 500)], ..before.clone() };
+        assert!(other.check_kept(&before).unwrap_err().to_string().contains("lost its store"));
+        let older = Health { version: (1, 900), ..before.clone() };
+        assert!(older.check_kept(&before).is_err());
+    }
+}
