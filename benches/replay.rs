@@ -223,7 +223,7 @@ fn restart_row(runtime: &Runtime, dir: &Path, peer: &mut Reverb) -> Result<Row> 
 fn in_process_row(dir: &Path) -> Result<Row> {
     const BATCH: usize = 256;
     let store = open(dir, SyncMode::Process)?;
-    let options = SampleOptions { batch: BATCH, n_step: 1, gamma: 0.97, seed: 1 };
+    let options = SampleOptions { batch: BATCH, n_step: 1, gamma: 0.97, seed: 1, segments: false };
     let mut sampler = Sampler::new(1);
     let flat = vec![0.5f32; FULL * VALUES];
     let mut rng = ChaCha8Rng::seed_from_u64(1);
@@ -371,7 +371,7 @@ fn sample(runtime: &Runtime, endpoint: &str, spec: &RunSpec, batch: usize) -> Re
     let options = RemoteOptions {
         endpoint: endpoint.to_owned(),
         spec: spec.clone(),
-        sample: SampleOptions { batch, n_step: 1, gamma: 0.97, seed: 1 },
+        sample: SampleOptions { batch, n_step: 1, gamma: 0.97, seed: 1, segments: false },
         name: "benchmark".to_owned(),
         table: String::new(),
         prefetch: PREFETCH,

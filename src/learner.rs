@@ -180,6 +180,7 @@ pub(crate) fn sample_options(config: &Config, incarnation: u64) -> SampleOptions
         n_step: config.sac.n_step,
         gamma: config.sac.gamma as f32,
         seed: config.seed.wrapping_add(incarnation << 32),
+        segments: false,
     }
 }
 

@@ -115,7 +115,7 @@ fn learns(mut source: impl MinibatchSource) {
 }
 
 fn options() -> SampleOptions {
-    SampleOptions { batch: 64, n_step: 1, gamma: 0.8, seed: 2 }
+    SampleOptions { batch: 64, n_step: 1, gamma: 0.8, seed: 2, segments: false }
 }
 
 #[test]

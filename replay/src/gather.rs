@@ -50,6 +50,28 @@ pub(crate) fn gather(ring: &Ring, drawn: &[Drawn], options: &SampleOptions) -> V
     gathered
 }
 
+/// Copies the whole segments of the transitions that were drawn, column by column, one segment after another.
+pub(crate) fn gather_segments(ring: &Ring, drawn: &[Drawn]) -> Vec<MinibatchColumn> {
+    let column = |column: &LayoutColumn| {
+        let mut data = Vec::new();
+        for drawn in drawn {
+            let entry = ring.entry_of(drawn.row);
+            let rows = match column.rows {
+                Rows::Once => 1,
+                Rows::Steps => entry.steps,
+                Rows::StepsPlusOne => entry.steps + 1,
+            };
+            let mut slot = ring.slot(entry.first_row);
+            for _ in 0..rows {
+                data.extend_from_slice(&ring.values(slot)[column.at.clone()]);
+                slot = ring.slot_after(slot);
+            }
+        }
+        MinibatchColumn { name: column.name.clone(), width: column.at.len(), data }
+    };
+    ring.layout().columns.iter().map(column).collect()
+}
+
 /// Follows up to `n` steps of the episode from the row `begin`; `reward` is the place of the reward in a row.
 fn span(ring: &Ring, begin: Row, reward: Option<usize>, n: usize, gamma: f32) -> Transition {
     let slot = ring.slot(begin);

@@ -94,7 +94,7 @@ fn columns_come_in_the_order_of_the_spec_then_the_next_states_then_the_discount(
     for segment in episodes(&[(30, Ending::Terminal), (20, Ending::Truncated)], 7) {
         ring.push(&segment);
     }
-    let options = SampleOptions { batch: 64, n_step: 1, gamma: GAMMA, seed: 0 };
+    let options = SampleOptions { batch: 64, n_step: 1, gamma: GAMMA, seed: 0, segments: false };
     let drawn = Sampler::new(5).draw_uniformly(&ring, options.batch);
     let columns = gather(&ring, &drawn, &options);
     let shape: Vec<_> = columns.iter().map(|c| (c.name.as_str(), c.width, c.data.len())).collect();

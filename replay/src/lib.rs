@@ -55,7 +55,7 @@ pub use export::{DatasetId, ExportError, Exported, export_minari, export_npz};
 pub use log::{Ever, Rewritten, Survey, WriterMark, compact, repair, segments};
 pub use metrics::ReplayMetrics;
 pub use minibatch::{
-    Item, MAX_N_STEP, Minibatch, MinibatchColumn, OptionsError, ReplayCounters, SampleOptions,
+    Item, MAX_N_STEP, Minibatch, MinibatchColumn, OptionsError, ReplayCounters, SampleOptions, SampledSegment,
 };
 pub use remote::{RemoteOptions, RemoteSource, describe, describe_table, take_snapshot, update_priorities};
 pub use sampler::Sampler;

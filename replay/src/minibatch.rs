@@ -13,6 +13,9 @@ pub struct SampleOptions {
     pub gamma: f32,
     /// Seeds the sampler.
     pub seed: u64,
+    /// Whether each draw gives the whole segment of the transition that was drawn; `n_step` and `gamma` do not count
+    /// then. A draw counts as one sample for the limiter, whatever it gives.
+    pub segments: bool,
 }
 
 /// Totals over a store's life; they survive restarts.
@@ -32,18 +35,22 @@ pub struct ReplayCounters {
     pub held: u64,
 }
 
-/// `batch` transitions, as contiguous columns.
+/// `batch` transitions, as contiguous columns; or `batch` whole segments.
 ///
 /// The columns of the run's spec come in its order: of a column with a row a step or T + 1 rows the row where the
 /// transition begins, of one with a row an episode that row. `reward` is the n-step sum Σ γᵏ·rₖ. Then, for every
 /// column of T + 1 rows, `next_<name>`: its row where the transition ends. Last comes `discount`: γ to the number
 /// of steps the transition spans, or 0 if it ends in a terminal state. A truncated episode's value goes on.
+///
+/// Of whole segments there are the spec's columns alone, each with the rows of all segments, one segment after another.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Minibatch {
     /// Each of `batch` × its width values.
     pub columns: Vec<MinibatchColumn>,
     /// What was drawn, transition by transition; empty where the store draws uniformly, without a limit.
     pub items: Vec<Item>,
+    /// What the segments are, where whole ones were asked for.
+    pub segments: Vec<SampledSegment>,
     /// The store's totals, this minibatch included.
     pub counters: ReplayCounters,
 }
@@ -57,6 +64,25 @@ pub struct Item {
     pub probability: f32,
 }
 
+/// A segment that was drawn: which it is, and how it ends.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct SampledSegment {
+    /// Who wrote it, and in which of its lanes.
+    pub writer: u64,
+    /// See `writer`.
+    pub lane: u32,
+    /// Counts the episodes of the lane.
+    pub episode: u64,
+    /// Index in the episode of its first step.
+    pub first_step: u32,
+    /// Its length.
+    pub steps: u32,
+    /// Whether its last step ended the episode in a terminal state, or at its time limit.
+    pub terminal: bool,
+    /// See `terminal`.
+    pub truncated: bool,
+}
+
 /// One column, row after row.
 #[derive(Clone, PartialEq, Debug)]
 pub struct MinibatchColumn {
@@ -64,7 +90,7 @@ pub struct MinibatchColumn {
     pub name: String,
     /// Values a row.
     pub width: usize,
-    /// `batch` × `width` values.
+    /// `batch` × `width` values; of whole segments as many rows as they have together.
     pub data: Vec<f32>,
 }
 
@@ -135,30 +161,51 @@ impl Minibatch {
             counters: Some(self.counters.into()),
             keys: self.items.iter().map(|item| item.key).collect(),
             probabilities: self.items.iter().map(|item| item.probability).collect(),
+            segments: self.segments.into_iter().map(SampledSegment::into_wire).collect(),
         }
     }
 
-    /// Parses a message; None unless every column has `batch` rows and the counters are there.
+    /// Parses a message; None unless every column has `batch` rows, or those of `batch` segments, and the counters are there.
     pub(crate) fn parse(wire: v1::Minibatch, batch: usize) -> Option<Self> {
-        let columns = wire.columns.into_iter().map(|column| MinibatchColumn::parse(column, batch));
+        let segments: Vec<_> = wire.segments.into_iter().map(SampledSegment::parse).collect();
+        let steps: usize = segments.iter().map(|segment| segment.steps as usize).sum();
+        [0, batch].contains(&segments.len()).then_some(())?;
+        // A row a segment, a step, or a step and its end.
+        let rows = if segments.is_empty() { vec![batch] } else { vec![batch, steps, steps + batch] };
+        let columns = wire.columns.into_iter().map(|column| MinibatchColumn::parse(column, &rows));
         let items = wire.keys.iter().zip(&wire.probabilities);
         let whole = wire.keys.len() == wire.probabilities.len() && [0, batch].contains(&wire.keys.len());
         whole.then_some(())?;
         Some(Self {
             columns: columns.collect::<Option<_>>()?,
             items: items.map(|(&key, &probability)| Item { key, probability }).collect(),
+            segments,
             counters: wire.counters?.into(),
         })
     }
 }
 
+impl SampledSegment {
+    fn into_wire(self) -> v1::SampledSegment {
+        let Self { writer, lane, episode, first_step, steps, terminal, truncated } = self;
+        v1::SampledSegment { writer, lane, episode, first_step, steps, terminal, truncated }
+    }
+
+    fn parse(wire: v1::SampledSegment) -> Self {
+        let v1::SampledSegment { writer, lane, episode, first_step, steps, terminal, truncated } = wire;
+        Self { writer, lane, episode, first_step, steps, terminal, truncated }
+    }
+}
+
 impl MinibatchColumn {
-    fn parse(wire: v1::MinibatchColumn, batch: usize) -> Option<Self> {
+    fn parse(wire: v1::MinibatchColumn, rows: &[usize]) -> Option<Self> {
         let v1::MinibatchColumn { name, width, data } = wire;
         let width = width as usize;
-        let values = width.checked_mul(batch)?;
-        let whole = data.len() == values.checked_mul(columns::VALUE_BYTES)?;
-        whole.then(|| Self { name, width, data: columns::iter(&data).collect() })
+        let whole = |rows: &usize| {
+            let bytes = width.checked_mul(*rows).and_then(|values| values.checked_mul(columns::VALUE_BYTES));
+            bytes == Some(data.len())
+        };
+        rows.iter().any(whole).then(|| Self { name, width, data: columns::iter(&data).collect() })
     }
 }
 

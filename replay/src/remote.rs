@@ -374,7 +374,7 @@ impl Fetching {
     }
 
     fn hello(&mut self) -> v1::SampleHello {
-        let SampleOptions { batch, n_step, gamma, seed } = self.options.sample;
+        let SampleOptions { batch, n_step, gamma, seed, segments } = self.options.sample;
         self.streams += 1;
         v1::SampleHello {
             spec: Some(self.options.spec.to_wire()),
@@ -385,6 +385,7 @@ impl Fetching {
             seed: seed.wrapping_add((self.streams - 1).wrapping_mul(0x9e37_79b9_7f4a_7c15)),
             name: self.options.name.clone(),
             table: self.options.table.clone(),
+            segments,
         }
     }
 

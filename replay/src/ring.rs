@@ -12,6 +12,7 @@
 //! the log equals the one that was lost.
 
 use crate::config::ReplayConfig;
+use crate::minibatch::SampledSegment;
 use crate::selector::Selector;
 use getup_proto::{ColumnSpec, Rows, RunSpec, Segment, columns};
 use rand::Rng;
@@ -94,6 +95,7 @@ pub(crate) struct Entry {
     first_key: u64,
     pub(crate) steps: usize,
     pub(crate) terminal: bool,
+    truncated: bool,
     /// Number of the segment that continues the episode.
     continued_by: Option<u64>,
     lane: Lane,
@@ -149,6 +151,7 @@ impl Ring {
             first_key: self.next_key,
             steps: segment.steps,
             terminal: segment.terminal,
+            truncated: segment.truncated,
             continued_by: None,
             lane: (segment.writer, segment.lane),
             episode: segment.episode,
@@ -252,6 +255,20 @@ impl Ring {
     /// The segment that a row belongs to.
     pub(crate) fn entry_of(&self, row: Row) -> &Entry {
         &self.segments[self.segments.partition_point(|entry| entry.first_row.0 <= row.0) - 1]
+    }
+
+    /// The segment that a row belongs to, as samplers are told of it.
+    pub(crate) fn segment_of(&self, row: Row) -> SampledSegment {
+        let entry = self.entry_of(row);
+        SampledSegment {
+            writer: entry.lane.0,
+            lane: entry.lane.1,
+            episode: entry.episode,
+            first_step: (entry.next_step - entry.steps as u64) as u32,
+            steps: entry.steps as u32,
+            terminal: entry.terminal,
+            truncated: entry.truncated,
+        }
     }
 
     /// The segment that continues the episode, where it is there.

@@ -7,11 +7,13 @@
 use crate::config::ReplayConfig;
 use crate::error::StoreError;
 use crate::gate::{Gate, Peer};
-use crate::gather::gather;
+use crate::gather::{gather, gather_segments};
 use crate::limiter::Limiter;
 use crate::log::{self, Log, State, Watermark};
 use crate::metrics::ReplayMetrics;
-use crate::minibatch::{Item, MAX_N_STEP, Minibatch, OptionsError, ReplayCounters, SampleOptions};
+use crate::minibatch::{
+    Item, MAX_N_STEP, Minibatch, MinibatchColumn, OptionsError, ReplayCounters, SampleOptions, SampledSegment,
+};
 use crate::ring::{Drawn, Ring};
 use crate::sampler::Sampler;
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment, columns, v1};
@@ -277,9 +279,10 @@ impl Store {
     /// [`OptionsError`] with the first option that is out of range.
     pub fn check_options(&self, options: &SampleOptions) -> Result<(), OptionsError> {
         let &SampleOptions { batch, n_step, gamma, .. } = options;
-        // At most two rows of every column, and a few numbers.
+        // At most two rows of every column, or the longest segment's, and a few numbers.
         let widths: usize = self.spec.columns.iter().map(|column| column.width).sum();
-        let max = MAX_MESSAGE_BYTES / 2 / ((2 * widths + 2) * columns::VALUE_BYTES);
+        let rows = if options.segments { self.spec.max_segment_steps + 1 } else { 2 };
+        let max = MAX_MESSAGE_BYTES / 2 / ((rows * widths + 2) * columns::VALUE_BYTES);
         if !(1..=max).contains(&batch) {
             return Err(OptionsError::Batch { batch, max });
         }
@@ -316,7 +319,7 @@ impl Store {
             sampled = total;
             self.watermark.set_sampled(total)
         };
-        let (columns, items, state, held) = if self.selects {
+        let (found, items, state, held) = if self.selects {
             let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
             if !self.gate.try_sample(options.batch as u64, count)? {
                 return Ok(None);
@@ -327,21 +330,22 @@ impl Store {
             let item =
                 |drawn: &Drawn| Item { key: ring.key(drawn.row), probability: drawn.probability as f32 };
             let items = drawn.iter().map(item).collect();
-            (gather(ring, &drawn, options), items, memory.state, ring.len())
+            (found(ring, &drawn, options), items, memory.state, ring.len())
         } else {
             if !self.gate.try_sample(options.batch as u64, count)? {
                 return Ok(None);
             }
             let memory = self.memory();
             let drawn = sampler.draw_uniformly(&memory.ring, options.batch);
-            let columns = gather(&memory.ring, &drawn, options);
-            (columns, Vec::new(), memory.state, memory.ring.len())
+            let found = found(&memory.ring, &drawn, options);
+            (found, Vec::new(), memory.state, memory.ring.len())
         };
         let counters = self.counters_of(state, sampled, held);
         self.metrics.sampled.inc_by(options.batch as u64);
         self.metrics.sample_seconds.observe(started.elapsed().as_secs_f64());
         self.show_limiter();
-        Ok(Some(Minibatch { columns, items, counters }))
+        let (columns, segments) = found;
+        Ok(Some(Minibatch { columns, items, segments, counters }))
     }
 
     /// Gives transitions priorities, by their keys; returns how many were there to get them. A priority of 0 is the
@@ -435,5 +439,18 @@ impl Store {
 
     fn memory(&self) -> RwLockReadGuard<'_, Memory> {
         self.memory.read().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The columns of what was drawn; of whole segments also what they are.
+fn found(
+    ring: &Ring,
+    drawn: &[Drawn],
+    options: &SampleOptions,
+) -> (Vec<MinibatchColumn>, Vec<SampledSegment>) {
+    if options.segments {
+        (gather_segments(ring, drawn), drawn.iter().map(|drawn| ring.segment_of(drawn.row)).collect())
+    } else {
+        (gather(ring, drawn, options), Vec::new())
     }
 }

@@ -141,6 +141,7 @@ fn a_client_that_stops_reading_delays_nobody_and_costs_no_memory() {
         seed: 1,
         name: "greedy".to_owned(),
         table: String::new(),
+        segments: false,
     };
     let (requests, outbound) = mpsc::channel(4);
     for message in [v1::sample_request::Message::Hello(hello), v1::sample_request::Message::Credits(u32::MAX)]

@@ -7,7 +7,7 @@
 mod common;
 mod fixtures;
 
-use bytes::Bytes;
+use bytes::{Buf, BufMut, Bytes};
 use fixtures::{Ending, Part, get_up_spec, spec};
 use getup_proto::{RunSpec, Segment, v1};
 use getup_replay::{SampleOptions, Survey};
@@ -15,7 +15,11 @@ use prost::Message;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::fs;
+use std::time::Duration;
 use tempfile::TempDir;
+use tonic::Status;
+use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
+use tonic::codegen::http::uri::PathAndQuery;
 
 fn inputs() -> u64 {
     if std::env::var_os("GETUP_TEST_FULL").is_some() { 500_000 } else { 1_000 }
@@ -98,6 +102,7 @@ fn requests_are_parsed_or_refused() {
         seed: 1,
         name: "learner".to_owned(),
         table: String::new(),
+        segments: false,
     };
     let sample =
         v1::SampleRequest { message: Some(v1::sample_request::Message::Hello(hello)) }.encode_to_vec();
@@ -114,10 +119,12 @@ fn requests_are_parsed_or_refused() {
             v1::SampleRequest::decode(Bytes::from(mangled(&mut rng, &sample)))
         {
             let (batch, n_step) = (hello.batch as usize, hello.n_step as usize);
-            let options = SampleOptions { batch, n_step, gamma: hello.gamma, seed: hello.seed };
+            let (gamma, seed, segments) = (hello.gamma, hello.seed, hello.segments);
+            let options = SampleOptions { batch, n_step, gamma, seed, segments };
             // What is accepted fits into a message.
             if replay.store.check_options(&options).is_ok() {
-                assert!(batch * (2 * 68 + 24) * 4 <= getup_proto::MAX_MESSAGE_BYTES);
+                let rows = if segments { 65 } else { 2 };
+                assert!(batch * (rows * 68 + 24) * 4 <= getup_proto::MAX_MESSAGE_BYTES);
             }
             check_spec(hello.spec);
         }
@@ -152,4 +159,118 @@ fn stored_files_are_read_or_named_as_damaged() {
         damaged += u64::from(!survey.damages.is_empty());
     }
     assert!(damaged > files / 4, "{damaged}: the inputs reach nothing");
+}
+
+/// Messages as they are: the client's side of a call sends any bytes, and takes any.
+#[derive(Clone, Default)]
+struct Raw;
+
+impl Codec for Raw {
+    type Encode = Vec<u8>;
+    type Decode = Vec<u8>;
+    type Encoder = Self;
+    type Decoder = Self;
+
+    fn encoder(&mut self) -> Self {
+        Self
+    }
+
+    fn decoder(&mut self) -> Self {
+        Self
+    }
+}
+
+impl Encoder for Raw {
+    type Item = Vec<u8>;
+    type Error = Status;
+
+    fn encode(&mut self, item: Vec<u8>, to: &mut EncodeBuf<'_>) -> Result<(), Status> {
+        to.put_slice(&item);
+        Ok(())
+    }
+}
+
+impl Decoder for Raw {
+    type Item = Vec<u8>;
+    type Error = Status;
+
+    fn decode(&mut self, from: &mut DecodeBuf<'_>) -> Result<Option<Vec<u8>>, Status> {
+        let bytes = from.copy_to_bytes(from.remaining());
+        Ok(Some(bytes.to_vec()))
+    }
+}
+
+#[test]
+fn a_running_service_refuses_every_mangled_request_and_goes_on() {
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    let spec = spec(8);
+    let replay = common::Replay::start(spec.clone(), &common::config());
+    let segment = |sequence| fixtures::segment(&spec, 1, sequence, 8);
+    replay.store.append((1..=20).map(segment).collect()).unwrap();
+    let hello = v1::SampleHello {
+        spec: Some(spec.to_wire()),
+        batch: 16,
+        n_step: 1,
+        gamma: 0.9,
+        ..v1::SampleHello::default()
+    };
+    let sample = |message| v1::SampleRequest { message: Some(message) }.encode_to_vec();
+    let append = |message| v1::AppendRequest { message: Some(message) }.encode_to_vec();
+    let priorities =
+        v1::UpdatePrioritiesRequest { keys: vec![1, 2], priorities: vec![0.5; 2], ..Default::default() };
+    // Each with the messages of a whole call.
+    let calls = [
+        ("Append", vec![append(common::hello(&spec, 2)), append(common::message(&segment(1)))]),
+        (
+            "Sample",
+            vec![
+                sample(v1::sample_request::Message::Hello(hello)),
+                sample(v1::sample_request::Message::Credits(2)),
+            ],
+        ),
+        ("Describe", vec![v1::DescribeRequest { table: "default".into() }.encode_to_vec()]),
+        ("UpdatePriorities", vec![priorities.encode_to_vec()]),
+        ("Snapshot", vec![v1::SnapshotRequest { name: "..".into(), ..Default::default() }.encode_to_vec()]),
+    ];
+    let channel = replay.runtime.block_on(async {
+        tonic::transport::Endpoint::from_shared(format!("http://{}", replay.endpoint))
+            .unwrap()
+            .connect()
+            .await
+            .unwrap()
+    });
+    let mut refused = 0;
+    let rounds = (inputs() / 5).min(20_000);
+    for _ in 0..rounds {
+        let (method, messages) = &calls[rng.random_range(0..calls.len())];
+        // One message of the call is mangled.
+        let place = rng.random_range(0..messages.len());
+        let mangle = |(index, message): (usize, &Vec<u8>)| {
+            if index == place { mangled(&mut rng, message) } else { message.clone() }
+        };
+        let messages: Vec<Vec<u8>> = messages.iter().enumerate().map(mangle).collect();
+        let path = PathAndQuery::from_maybe_shared(format!("/getup.v1.Replay/{method}")).unwrap();
+        let mut client = tonic::client::Grpc::new(channel.clone());
+        let outcome = replay.runtime.block_on(async {
+            client.ready().await.unwrap();
+            let request = tonic::Request::new(tokio_stream::iter(messages));
+            let answers = async {
+                let mut replies = client.streaming(request, path, Raw).await?.into_inner();
+                // A stream that is right ends with its requests, or after what it was asked for.
+                while tokio::time::timeout(Duration::from_millis(200), replies.message())
+                    .await
+                    .is_ok_and(|reply| matches!(reply, Ok(Some(_))))
+                {}
+                Ok::<(), Status>(())
+            };
+            answers.await
+        });
+        refused += u64::from(outcome.is_err());
+    }
+    // It is there, and what it held is whole.
+    let described = replay.runtime.block_on(getup_replay::describe(&replay.endpoint)).unwrap();
+    assert!(described.size >= 160, "{}", described.size);
+    assert!(refused > rounds / 20, "{refused} of {rounds}: the inputs reach nothing");
+    let (ended, _) = replay.stop();
+    ended.unwrap();
 }

@@ -151,7 +151,7 @@ proptest! {
                     group.iter().for_each(|segment| model.append(segment, capacity));
                 }
                 Action::Sample(batch, n_step) => {
-                    let options = SampleOptions { batch, n_step, gamma: 0.9, seed: 0 };
+                    let options = SampleOptions { batch, n_step, gamma: 0.9, seed: 0, segments: false };
                     let Some(minibatch) = store.try_sample(&mut sampler, &options).unwrap() else {
                         prop_assert_eq!(model.env_steps, 0, "sampling waits for the first env step alone");
                         continue;

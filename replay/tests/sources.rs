@@ -5,6 +5,7 @@ mod fixtures;
 
 use common::{Replay, config, eventually, options};
 use fixtures::{Ending, Part, segment, spec, value};
+use getup_proto::columns;
 use getup_replay::{
     LocalSource, Minibatch, MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, ReplayMetrics,
     SampleError, SampleOptions, Store, serve,
@@ -46,6 +47,7 @@ macro_rules! both_sources {
 both_sources! {
     minibatches_hold_whole_transitions_of_what_was_appended
     n_step_returns_span_segments
+    whole_segments_come_as_they_were_appended
     counters_come_with_every_minibatch
     the_first_sample_waits_for_the_minimum_and_says_why
     sampling_waits_for_inserts_and_stays_in_the_band
@@ -114,6 +116,41 @@ fn n_step_returns_span_segments(connect: Connect) {
         assert_eq!(data("discount")[i], if end == 12 { 0.0 } else { 0.5f32.powi(5) });
         assert_eq!(data("next_observation")[3 * i], value(1, 0, 0, end, 0, 0));
     }
+}
+
+fn whole_segments_come_as_they_were_appended(connect: Connect) {
+    let replay = Replay::start(spec(8), &config());
+    let lengths = [8, 3, 1, 5];
+    let appended: Vec<_> =
+        lengths.iter().zip(1..).map(|(&steps, sequence)| segment(&replay.spec, 1, sequence, steps)).collect();
+    replay.store.append(appended.clone()).unwrap();
+    let mut source = connect(&replay, SampleOptions { segments: true, ..options(64) }).unwrap();
+    let minibatch = source.next().unwrap();
+    assert_eq!((minibatch.segments.len(), minibatch.counters.sampled), (64, 64));
+    assert!(minibatch.column("discount").is_none());
+    let mut rows = vec![0; minibatch.columns.len()];
+    let mut seen = [0; 4];
+    for sampled in &minibatch.segments {
+        let index = lengths.iter().position(|&steps| steps == sampled.steps as usize).unwrap();
+        seen[index] += 1;
+        let (whole, of_spec) = (&appended[index], &replay.spec.columns);
+        assert_eq!((sampled.writer, sampled.lane, sampled.episode), (1, whole.lane, whole.episode));
+        assert_eq!((sampled.first_step, sampled.terminal), (whole.first_step, whole.terminal));
+        for ((column, bytes), row) in minibatch.columns.iter().zip(&whole.columns).zip(&mut rows) {
+            let values: Vec<f32> = columns::iter(bytes).collect();
+            assert_eq!(&column.data[*row..*row + values.len()], values, "{} of segment {index}", column.name);
+            *row += values.len();
+        }
+        assert_eq!(of_spec.len(), minibatch.columns.len());
+    }
+    // All is accounted for, and the longer a segment the more often it is drawn.
+    assert!(minibatch.columns.iter().zip(&rows).all(|(column, row)| column.data.len() == *row));
+    assert!(seen[0] > seen[2], "{seen:?}");
+    assert!(
+        connect(&replay, SampleOptions { segments: true, ..options(1_000_000) })
+            .is_err_and(|error| { matches!(error, SampleError::Options(_)) })
+            || replay.store.check_options(&SampleOptions { segments: true, ..options(1_000_000) }).is_err()
+    );
 }
 
 fn counters_come_with_every_minibatch(connect: Connect) {

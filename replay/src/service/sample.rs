@@ -31,6 +31,7 @@ pub(super) fn source(
         n_step: hello.n_step as usize,
         gamma: hello.gamma,
         seed: hello.seed,
+        segments: hello.segments,
     };
     let name = named(hello.name, || "a sampler".to_owned());
     LocalSource::new(store.clone(), options, &name, shutdown).map_err(status)

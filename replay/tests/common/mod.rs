@@ -25,7 +25,7 @@ pub fn config() -> ReplayConfig {
 }
 
 pub fn options(batch: usize) -> SampleOptions {
-    SampleOptions { batch, n_step: 1, gamma: 0.99, seed: 5 }
+    SampleOptions { batch, n_step: 1, gamma: 0.99, seed: 5, segments: false }
 }
 
 pub fn open(dir: &Path, spec: &RunSpec, config: &ReplayConfig) -> Result<Store, StoreError> {
