@@ -3,9 +3,11 @@
 //! `xtask` builds without MuJoCo or libtorch, so that it can be the program that brings them.
 
 mod ablate;
+mod audit;
 mod native;
 mod plot;
 mod prerequisites;
+mod sbom;
 mod tasks;
 
 use anyhow::Result;
@@ -46,8 +48,15 @@ enum Command {
         #[arg(long, conflicts_with = "full")]
         cluster: bool,
     },
-    /// Format, clippy and documentation, without a warning.
+    /// Format, clippy, documentation and dependencies (see `audit`), without a warning.
     Check,
+    /// Licences, sources and known faults of the dependencies, by cargo-deny as `deny.toml` says.
+    ///
+    /// The first time builds cargo-deny into .native/tools/. Where the RustSec database cannot be fetched, advisories
+    /// are not checked, and that is said.
+    Audit,
+    /// Write target/sbom/IMAGE.cdx.json: what the images slim, learner and learner-cuda hold, as CycloneDX.
+    Sbom,
     /// Run one benchmark: prints a table and writes `target/bench/NAME.json`.
     Bench {
         /// The benchmark; a file of this name lies in `benches/`.
@@ -97,8 +106,11 @@ fn main() -> Result<()> {
         }
         Command::Check => {
             native::set_up(false)?;
-            tasks::check()
+            tasks::check()?;
+            audit::audit()
         }
+        Command::Audit => audit::audit(),
+        Command::Sbom => sbom::write(),
         Command::Bench { name } => {
             native::set_up(false)?;
             tasks::bench(&name)

@@ -14,11 +14,11 @@ use crate::prerequisites;
 
 /// MuJoCo's version, as in the name of its library.
 const MUJOCO: &str = "3.17.0";
-/// What every build needs.
-const WHEELS: &[&str] =
+/// What every build needs; without libtorch the first is enough.
+pub(crate) const WHEELS: &[&str] =
     &["mujoco==3.17.0", "torch==2.11.0", "nvidia-cuda-runtime==13.0.96", "nvidia-cuda-cupti==13.0.85"];
 /// What `libtorch_cuda.so` of that torch needs beside them; it looks for them in the same folder.
-const CUDA_WHEELS: &[&str] = &[
+pub(crate) const CUDA_WHEELS: &[&str] = &[
     "nvidia-cublas==13.1.0.3",
     "nvidia-cuda-nvrtc==13.0.88",
     "nvidia-cudnn-cu13==9.19.0.56",
@@ -50,7 +50,8 @@ pub(crate) fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask lies in the root").to_owned()
 }
 
-fn native() -> PathBuf {
+/// What is installed for this checkout, and ignored by git.
+pub(crate) fn native() -> PathBuf {
     root().join(".native")
 }
 

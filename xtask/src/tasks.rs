@@ -7,7 +7,8 @@ use anyhow::{Context, Result, bail};
 
 use crate::native::{self, peers_python, reverb_python, root, run};
 
-fn cargo() -> Command {
+/// Cargo, in the root of the repository.
+pub(crate) fn cargo() -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     command.current_dir(root());
     // Cargo gave this process the paths that held before it wrote them anew: let the next one read the file.
