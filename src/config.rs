@@ -83,6 +83,12 @@ pub(crate) struct NetworkConfig {
     pub(crate) actor_metrics: String,
 }
 
+/// Where this machine reaches a service of this address: one that listens everywhere is here too, under the name that is in
+/// every certificate.
+pub(crate) fn reached_at(address: &str) -> String {
+    address.replace("0.0.0.0:", "localhost:").replace("[::]:", "localhost:")
+}
+
 impl NetworkConfig {
     /// The addresses of all replays.
     pub(crate) fn replays(&self) -> Vec<String> {

@@ -4,10 +4,10 @@ use std::io::{Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
 use std::time::Duration;
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use clap::ValueEnum;
 
-use crate::config::ConfigArgs;
+use crate::config::{ConfigArgs, reached_at};
 
 const PATIENCE: Duration = Duration::from_secs(3);
 
@@ -40,8 +40,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         !address.ends_with(":0"),
         "network.{name}_metrics = {address}: a role that takes any port cannot be found; give it one, there and here"
     );
-    // Who listens everywhere is here too.
-    let address = address.replace("0.0.0.0:", "127.0.0.1:").replace("[::]:", "[::1]:");
+    let address = reached_at(&address);
     let answer = ask(&address).with_context(|| format!("the {name} does not answer at {address}"))?;
     let (head, body) = answer.split_once("\r\n\r\n").unwrap_or((&answer, ""));
     if head.split(' ').nth(1) != Some("200") {
@@ -52,12 +51,23 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
 }
 
 fn ask(address: &str) -> Result<String> {
-    let resolved = address.to_socket_addrs()?.next().context("the name has no address")?;
-    let mut stream = TcpStream::connect_timeout(&resolved, PATIENCE)?;
+    let mut stream = connect(address)?;
     stream.set_read_timeout(Some(PATIENCE))?;
     write!(stream, "GET /healthz HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n")?;
     let mut answer = String::new();
     // More than this no role answers.
     stream.take(1 << 16).read_to_string(&mut answer)?;
     Ok(answer)
+}
+
+/// A name may have several addresses, and the role listens at one of them.
+fn connect(address: &str) -> Result<TcpStream> {
+    let mut refused = None;
+    for resolved in address.to_socket_addrs()? {
+        match TcpStream::connect_timeout(&resolved, PATIENCE) {
+            Ok(stream) => return Ok(stream),
+            Err(error) => refused = Some(error),
+        }
+    }
+    Err(refused.map_or_else(|| anyhow!("the name has no address"), Into::into))
 }

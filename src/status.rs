@@ -10,7 +10,7 @@ use getup_transport::{ChannelOptions, Credentials, Endpoint};
 use serde_json::json;
 use tonic::Status;
 
-use crate::config::ConfigArgs;
+use crate::config::{ConfigArgs, reached_at};
 
 const TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -29,7 +29,7 @@ pub(crate) async fn run(arguments: Args) -> Result<()> {
     let config = arguments.config.load()?;
     let replays = config.network.replays();
     let credentials = Credentials::load(&config.security)?;
-    let at = |address: &str| Endpoint::new(address, &credentials);
+    let at = |address: &str| Endpoint::new(&reached_at(address), &credentials);
     let asking = join_all(replays.iter().map(|address| ask_replay(at(address))));
     let (replays, learner) = tokio::join!(asking, ask_learner(at(&config.network.learner)));
     if arguments.json {

@@ -8,7 +8,7 @@ use getup_replay::{DatasetId, Exported, Rewritten, Survey, export_minari, export
 use getup_transport::{Credentials, Endpoint};
 use serde_json::json;
 
-use crate::config::ConfigArgs;
+use crate::config::{ConfigArgs, reached_at};
 use crate::output::progress_bar;
 
 /// A tool and its arguments.
@@ -253,7 +253,7 @@ async fn snapshot(name: &str, table: &str, config: &ConfigArgs, json: bool) -> R
     let config = config.load()?;
     let credentials = Credentials::load(&config.security)?;
     for address in config.network.replays() {
-        snapshot_of(&Endpoint::new(&address, &credentials), name, table, json).await?;
+        snapshot_of(&Endpoint::new(&reached_at(&address), &credentials), name, table, json).await?;
     }
     Ok(())
 }
