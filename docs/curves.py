@@ -1,9 +1,11 @@
 """The figures of docs/ and the table of the runs, from what runs leave in docs/runs/.
 
-    cargo xtask plot    runs `curves.py plot`: learning-curve.png, torque-limit.png, standing.png, ablation.png
+    cargo xtask plot    runs `curves.py plot`: learning-curve.png, torque-limit.png, standing.png, ablation.png,
+                        fleet.png
     cargo xtask runs    runs `curves.py table`: a Markdown table on standard output
 
 A run is a folder NAME-SEED with three files that `getup train` wrote: config.toml, evaluations.jsonl, timings.jsonl.
+fleet.json is no run: `cargo xtask bench fleet` wrote it, with GETUP_FLEET_RECORD=1.
 What is left out, and why, is said on standard error.
 """
 
@@ -28,6 +30,7 @@ except ModuleNotFoundError:  # Python 3.10
 DOCS = Path(__file__).resolve().parent
 RUNS = DOCS / "runs"
 FILES = ("config.toml", "evaluations.jsonl", "timings.jsonl")
+FLEET = RUNS / "fleet.json"
 
 # The return over which every fall must come for β to go down, §5 of the paper.
 OMEGA = 60.0
@@ -43,6 +46,9 @@ ABLATION = {
     "fixed-50": ("fixed at 50 %", "#CC79A7"),
     "fixed-40": ("fixed at 40 %", "#555555"),
 }
+
+# The fleet's processes, of the same set.
+ROLES = {"replay": "#0072B2", "learner": "#E69F00", "load": "#555555"}
 
 STYLE = {
     "font.size": 10,
@@ -159,6 +165,20 @@ def read_lines(path):
             sys.exit(f"error: {path}, line {number} is not JSON ({error}): copy the file anew from the run")
 
 
+def read_fleet():
+    """The points of the fleet, in the order of their numbers of actors; none where it was not measured."""
+    if not FLEET.is_file():
+        return []
+    try:
+        fleet = json.loads(FLEET.read_text(encoding="utf-8"))
+        # The further point, with fewer broadcasts, is docs/scale.md's.
+        usual = fleet["broadcasts_per_second"]
+        points = [point for point in fleet["points"] if point["broadcasts"] == usual]
+        return sorted(points, key=lambda point: point["actors"])
+    except (KeyError, json.JSONDecodeError) as error:
+        sys.exit(f"error: {FLEET} is not what this version of `cargo xtask bench fleet` writes ({error!r})")
+
+
 # Figures
 
 
@@ -265,7 +285,41 @@ def ablation(runs):
     return figure
 
 
-def plot(runs, ablated):
+def fleet(points):
+    """Latencies, and the processor time of each process, over the number of simulated actors."""
+    figure, (lag, append, cpu) = plt.subplots(1, 3, figsize=(9, 3.2))
+    actors = [point["actors"] for point in points]
+    dots = {"marker": "o", "markersize": 3}
+
+    def column(name, scale=1.0):
+        return [scale * point[name] for point in points]
+
+    for axes, name, label in ((lag, "lag", "broadcast lag (ms)"), (append, "append", "append (ms)")):
+        for share, style in (("99", "-"), ("50", (0, (4, 2)))):
+            values = column(f"{name}_p{share}", 1000)
+            axes.plot(actors, values, color="#0072B2", linestyle=style, label=f"p{share}", **dots)
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.set_ylabel(label)
+        axes.legend(loc="upper left")
+    for role, colour in ROLES.items():
+        cpu.plot(actors, column(f"cpu_{role}"), color=colour, label=role, **dots)
+    cpu.set_ylabel("processor time (s/s)")
+    cpu.set_ylim(bottom=0)
+    cpu.legend(loc="upper left")
+    for axes in (lag, append, cpu):
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(actors, [f"{number}" for number in actors])
+        axes.set_xlabel("actors")
+    return figure
+
+
+def save(name, figure):
+    figure.savefig(DOCS / name)
+    plt.close(figure)
+
+
+def plot(runs, ablated, points):
     """Draws every figure that there are runs for."""
     learners = [run for run in runs if run.family != "standing"]
     standers = [run for run in runs if run.family == "standing" and None not in run.column("stands")]
@@ -280,10 +334,14 @@ def plot(runs, ablated):
             leave_out(f"docs/{name}", why)
             continue
         with plt.rc_context(STYLE):
-            figure = draw(of)
-            figure.savefig(DOCS / name)
-        plt.close(figure)
+            save(name, draw(of))
         print(f"docs/{name}: {', '.join(run.name for run in of)}")
+    if points:
+        with plt.rc_context(STYLE):
+            save("fleet.png", fleet(points))
+        print(f"docs/fleet.png: {len(points)} numbers of actors")
+    else:
+        leave_out("docs/fleet.png", "no docs/runs/fleet.json, of cargo xtask bench fleet")
 
 
 # Table
@@ -324,7 +382,7 @@ def main():
         files = ", ".join(FILES)
         sys.exit(f"error: no run in {RUNS}: copy {files} of a run to docs/runs/NAME-SEED/, such as laptop-1/")
     if mode == ["plot"]:
-        plot(runs, ablated)
+        plot(runs, ablated, read_fleet())
     else:
         table([run for run in runs if run.family != "standing"])
 

@@ -17,6 +17,9 @@ pub(crate) struct Args {
     /// A host name or address by which a role is reached, such as replay; may be repeated. localhost is always there.
     #[arg(long = "name", value_name = "HOST")]
     names: Vec<String>,
+    /// Where ca.key is kept, away from what the roles can read. [default: DIR]
+    #[arg(long, value_name = "DIR")]
+    authority: Option<PathBuf>,
     /// Leave a certificate that is valid for these names, and for another month, as it is.
     #[arg(long)]
     if_missing: bool,
@@ -27,7 +30,8 @@ pub(crate) struct Args {
 
 pub(crate) fn run(arguments: Args) -> Result<()> {
     let dir = &arguments.dir;
-    let issued = make_authority(dir, &arguments.names, arguments.if_missing)?;
+    let vault = arguments.authority.as_ref().unwrap_or(dir);
+    let issued = make_authority(dir, vault, &arguments.names, arguments.if_missing)?;
     let shown = dir.display();
     println!(
         "{}",

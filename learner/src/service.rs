@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use futures::{Stream, StreamExt};
 use getup_proto::v1::learner_server::{Learner, LearnerServer};
-use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, v1};
+use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, SpecError, v1};
 use getup_telemetry::Shutdown;
 use tokio_stream::wrappers::WatchStream;
 use tonic::{Request, Response, Status};
@@ -51,7 +51,10 @@ impl Learner for Service {
     ) -> Result<Response<Self::SubscribeStream>, Status> {
         let request = request.into_inner();
         let spec = request.spec.ok_or_else(|| Status::invalid_argument("the subscription names no spec"))?;
-        let spec = RunSpec::parse(spec).map_err(|error| Status::invalid_argument(error.to_string()))?;
+        let spec = RunSpec::parse(spec).map_err(|error| match error {
+            SpecError::Protocol { .. } => Status::failed_precondition(error.to_string()),
+            malformed => Status::invalid_argument(malformed.to_string()),
+        })?;
         let policies = WatchStream::new(self.hub.subscribe(&spec)?);
         tracing::info!(actor = request.actor, "actor subscribed");
         let updates = policies

@@ -21,6 +21,11 @@ pub use version::PolicyVersion;
 /// gRPC's usual 4 MiB are too few: an update of a 2 × 1024 policy is larger, and so are large minibatches.
 pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
 
+/// The version of the protocol that this crate speaks.
+pub const PROTOCOL: u32 = 1;
+/// The oldest version that it still understands: roles of this one and later may run beside it, as in a rolling restart.
+pub const OLDEST_PROTOCOL: u32 = 1;
+
 /// Generated from the .proto files: messages, clients and servers.
 #[allow(missing_docs, unreachable_pub, clippy::all, rustdoc::all)]
 pub mod v1 {

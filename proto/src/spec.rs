@@ -1,6 +1,6 @@
 //! What the transitions of a run look like: [`RunSpec`].
 
-use crate::{columns, v1};
+use crate::{OLDEST_PROTOCOL, PROTOCOL, columns, v1};
 use serde::{Deserialize, Serialize};
 use std::collections::HashSet;
 
@@ -98,6 +98,16 @@ pub enum SpecError {
         /// Of its columns.
         bytes: usize,
     },
+    /// The peer speaks another version of the protocol.
+    #[error(
+        "the peer speaks version {theirs} of the protocol, this getup {OLDEST_PROTOCOL} to {PROTOCOL}: upgrade {older}"
+    )]
+    Protocol {
+        /// As it says; 0 is from before there were versions.
+        theirs: u32,
+        /// Whose getup is too old.
+        older: &'static str,
+    },
     /// Two specs that should be the same are not.
     #[error(
         "another run's spec: {what} is {theirs} and should be {ours}. Give every role the same configuration, \
@@ -126,6 +136,13 @@ impl RunSpec {
     /// # Errors
     /// [`SpecError`] if it is malformed.
     pub fn parse(wire: v1::RunSpec) -> Result<Self, SpecError> {
+        match wire.protocol {
+            theirs if theirs < OLDEST_PROTOCOL => {
+                return Err(SpecError::Protocol { theirs, older: "the peer" });
+            }
+            theirs if theirs > PROTOCOL => return Err(SpecError::Protocol { theirs, older: "this one" }),
+            _ => {}
+        }
         let columns = wire.columns.into_iter().map(ColumnSpec::parse).collect::<Result<_, _>>()?;
         let spec = Self {
             run: wire.run,
@@ -175,6 +192,7 @@ impl RunSpec {
             task: self.task.clone(),
             columns: self.columns.iter().map(ColumnSpec::to_wire).collect(),
             max_segment_steps: self.max_segment_steps as u32,
+            protocol: PROTOCOL,
         }
     }
 
@@ -291,6 +309,14 @@ mod tests {
         assert_eq!(RunSpec::parse(spec().to_wire()), Ok(spec()));
         assert_eq!(spec().column("reward"), Some(2));
         assert_eq!(spec().column("torque"), None);
+    }
+
+    #[test]
+    fn another_protocol_is_refused_by_who_has_to_upgrade() {
+        let of =
+            |protocol| RunSpec::parse(v1::RunSpec { protocol, ..spec().to_wire() }).unwrap_err().to_string();
+        assert!(of(OLDEST_PROTOCOL - 1).ends_with("upgrade the peer"));
+        assert!(of(PROTOCOL + 1).ends_with("upgrade this one"));
     }
 
     #[test]

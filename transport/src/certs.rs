@@ -84,20 +84,28 @@ pub enum CertsError {
 }
 
 /// Issues `peer.pem` and `peer.key` in `dir` for a peer that is reached by `names` (DNS names, `*.` before them
-/// included, and IP addresses), or from its own machine. The authority, `ca.pem` and `ca.key`, is made if it is not
-/// there. Keys can be read by their owner alone; files are replaced as a whole.
+/// included, and IP addresses), or from its own machine. The authority, `ca.pem` in `dir` and `ca.key` in `vault`, is made
+/// if it is not there; the two may be one folder. Keys can be read by their owner alone; files are replaced as a whole.
 ///
 /// With `if_missing` nothing is done while `peer.pem` is good for all the names and for another 30 days.
 ///
 /// # Errors
 /// [`CertsError`].
-pub fn make_authority(dir: &Path, names: &[String], if_missing: bool) -> Result<Issued, CertsError> {
+pub fn make_authority(
+    dir: &Path,
+    vault: &Path,
+    names: &[String],
+    if_missing: bool,
+) -> Result<Issued, CertsError> {
     let names = subject_names(names)?;
     if if_missing && check(dir, &names, SystemTime::now() + PEER_LEFT).is_ok() {
         return Ok(Issued::Nothing);
     }
-    std::fs::create_dir_all(dir).map_err(|source| CertsError::File { path: dir.to_owned(), source })?;
-    let authority = Authority::open(dir)?;
+    for folder in [dir, vault] {
+        let error = |source| CertsError::File { path: folder.to_owned(), source };
+        std::fs::create_dir_all(folder).map_err(error)?;
+    }
+    let authority = Authority::open(dir, vault)?;
     let key = KeyPair::generate()?;
     let certificate =
         peer_params(&names)?.signed_by(&key, &Issuer::from_params(&params(), &authority.key))?;
@@ -118,9 +126,9 @@ struct Authority {
 }
 
 impl Authority {
-    /// The one of the folder, or a new one. A key without a certificate, as a crash leaves it, gets one.
-    fn open(dir: &Path) -> Result<Self, CertsError> {
-        let (certificate, key_file) = (dir.join("ca.pem"), dir.join("ca.key"));
+    /// The one of the folders, or a new one. A key without a certificate, as a crash leaves it, gets one.
+    fn open(dir: &Path, vault: &Path) -> Result<Self, CertsError> {
+        let (certificate, key_file) = (dir.join("ca.pem"), vault.join("ca.key"));
         let key = read(&key_file)?;
         if let Some(bytes) = read(&certificate)? {
             let Some(key) = key else { return Err(CertsError::NoKey { certificate, key: key_file }) };
@@ -132,7 +140,7 @@ impl Authority {
             Some(key) => parse_key(&key_file, &key)?,
             None => {
                 let key = KeyPair::generate()?;
-                write(dir, "ca.key", key.serialize_pem().as_bytes(), 0o600)?;
+                write(vault, "ca.key", key.serialize_pem().as_bytes(), 0o600)?;
                 key
             }
         };

@@ -14,7 +14,7 @@ fn names(names: &[&str]) -> Vec<String> {
 #[test]
 fn an_authority_is_made_once_and_issues_again_and_again() {
     let folder = Folder::new();
-    let issue = |named: &[&str]| make_authority(folder.path(), &names(named), false).unwrap();
+    let issue = |named: &[&str]| make_authority(folder.path(), folder.path(), &names(named), false).unwrap();
     assert_eq!(issue(&["replay", "*.actors.example", "10.0.0.5"]), Issued::AuthorityAndPeer);
     let (authority, peer) = (folder.text("ca.pem"), folder.text("peer.pem"));
     assert_eq!(issue(&[]), Issued::Peer);
@@ -28,7 +28,14 @@ fn an_authority_is_made_once_and_issues_again_and_again() {
 #[test]
 fn keys_are_for_their_owner_alone() {
     let folder = Folder::new();
-    make_authority(&folder.path().join("new/folder"), &[], false).unwrap();
+    let (new, vault) = (folder.path().join("new/folder"), folder.path().join("vault"));
+    make_authority(&new, &vault, &[], false).unwrap();
+    assert!(vault.join("ca.key").exists() && !new.join("ca.key").exists());
+    assert_eq!(
+        make_authority(&new, &vault, &[], false).unwrap(),
+        Issued::Peer,
+        "the authority is found again"
+    );
     let mode = |name: &str| {
         folder.path().join("new/folder").join(name).metadata().unwrap().permissions().mode() & 0o777
     };
@@ -39,7 +46,7 @@ fn keys_are_for_their_owner_alone() {
 #[test]
 fn nothing_is_done_while_the_certificate_is_good_for_all_names() {
     let folder = Folder::new();
-    let issue = |named: &[&str]| make_authority(folder.path(), &names(named), true).unwrap();
+    let issue = |named: &[&str]| make_authority(folder.path(), folder.path(), &names(named), true).unwrap();
     assert_eq!(issue(&["replay"]), Issued::AuthorityAndPeer);
     let peer = folder.text("peer.pem");
     assert_eq!((issue(&["replay"]), issue(&[])), (Issued::Nothing, Issued::Nothing));
@@ -56,24 +63,25 @@ fn nothing_is_done_while_the_certificate_is_good_for_all_names() {
 #[test]
 fn an_authority_that_lost_its_certificate_gets_one_that_its_peers_believe() {
     let folder = Folder::new();
-    make_authority(folder.path(), &[], false).unwrap();
+    make_authority(folder.path(), folder.path(), &[], false).unwrap();
     std::fs::remove_file(folder.path().join("ca.pem")).unwrap();
     let peer = [folder.text("peer.pem"), folder.text("peer.key")];
-    make_authority(folder.path(), &[], false).unwrap();
+    make_authority(folder.path(), folder.path(), &[], false).unwrap();
     folder.write("peer.pem", &peer[0]);
     folder.write("peer.key", &peer[1]);
-    assert_eq!(make_authority(folder.path(), &[], true).unwrap(), Issued::Nothing);
+    assert_eq!(make_authority(folder.path(), folder.path(), &[], true).unwrap(), Issued::Nothing);
 }
 
 #[test]
 fn what_cannot_be_issued_is_refused_with_the_way_out() {
     let (folder, other) = (Folder::new(), Folder::new());
-    let refused =
-        |named: &[&str]| make_authority(folder.path(), &names(named), false).unwrap_err().to_string();
+    let refused = |named: &[&str]| {
+        make_authority(folder.path(), folder.path(), &names(named), false).unwrap_err().to_string()
+    };
     let error = refused(&["no name"]);
     assert!(error.contains("\"no name\" is neither a DNS name nor an IP address"), "{error}");
-    make_authority(folder.path(), &[], false).unwrap();
-    make_authority(other.path(), &[], false).unwrap();
+    make_authority(folder.path(), folder.path(), &[], false).unwrap();
+    make_authority(other.path(), other.path(), &[], false).unwrap();
     let peer = folder.text("peer.pem");
     folder.write("ca.key", other.text("ca.key"));
     let error = refused(&[]);

@@ -11,8 +11,8 @@ use getup_transport::{
 #[test]
 fn a_file_that_cannot_be_used_is_named_with_its_setting_and_the_way_out() {
     let (folder, other) = (Folder::new(), Folder::new());
-    make_authority(folder.path(), &[], false).unwrap();
-    make_authority(other.path(), &[], false).unwrap();
+    make_authority(folder.path(), folder.path(), &[], false).unwrap();
+    make_authority(other.path(), other.path(), &[], false).unwrap();
     let good = folder.tls();
     let junk = folder.write("junk", "not PEM");
     let wrong = [
@@ -45,7 +45,7 @@ fn a_file_that_cannot_be_used_is_named_with_its_setting_and_the_way_out() {
 #[tokio::test]
 async fn nothing_that_can_be_printed_shows_a_secret() {
     let folder = Folder::new();
-    make_authority(folder.path(), &[], false).unwrap();
+    make_authority(folder.path(), folder.path(), &[], false).unwrap();
     let token = generate_token();
     let config = SecurityConfig { token_file: folder.write("token", &token), ..folder.tls() };
     let credentials = Credentials::load(&config).unwrap();

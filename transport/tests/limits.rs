@@ -69,7 +69,7 @@ async fn a_connection_without_a_call_that_is_let_in_is_closed_and_one_with_such_
 #[tokio::test]
 async fn a_peer_that_does_not_finish_the_tls_handshake_is_dropped() {
     let folder = Folder::new();
-    make_authority(folder.path(), &[], false).unwrap();
+    make_authority(folder.path(), folder.path(), &[], false).unwrap();
     let limits = Limits { handshake_timeout: Duration::from_millis(100), ..Limits::default() };
     let port = Port::limited(&folder.tls(), limits).await;
     let mut silent = TcpStream::connect(port.address).await.unwrap();

@@ -17,7 +17,7 @@ use tonic::Code;
 /// A folder with an authority and a peer of it.
 fn authority() -> Folder {
     let folder = Folder::new();
-    make_authority(folder.path(), &[], false).unwrap();
+    make_authority(folder.path(), folder.path(), &[], false).unwrap();
     folder
 }
 
@@ -27,7 +27,7 @@ fn another_peer(of: &Folder) -> Folder {
     for name in ["ca.pem", "ca.key"] {
         folder.write(name, of.text(name));
     }
-    make_authority(folder.path(), &[], false).unwrap();
+    make_authority(folder.path(), folder.path(), &[], false).unwrap();
     folder
 }
 
@@ -108,7 +108,7 @@ async fn a_renewed_certificate_is_shown_to_new_connections_without_a_restart() {
     let other_name = channel(&format!("127.0.0.2:{}", port.address.port()), &client);
     let (_, message) = refusal(&other_name).await;
     assert!(message.contains("not valid for name"), "{message}");
-    make_authority(server.path(), &["127.0.0.2".to_owned()], false).unwrap();
+    make_authority(server.path(), server.path(), &["127.0.0.2".to_owned()], false).unwrap();
     eventually(async || call(&other_name).await.is_ok()).await;
     call(&open).await.unwrap();
 }

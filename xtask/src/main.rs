@@ -74,8 +74,9 @@ enum Command {
     ///
     /// To show a run, copy its config.toml, evaluations.jsonl and timings.jsonl to docs/runs/NAME-SEED/, such as
     /// docs/runs/laptop-1/. They become docs/learning-curve.png and docs/torque-limit.png; a run in docs/runs/standing/
-    /// becomes docs/standing.png, and the runs of `cargo xtask ablate` docs/ablation.png. A figure without a run is
-    /// left out, and said to be. The first time installs matplotlib into .native/plots/.
+    /// becomes docs/standing.png, and the runs of `cargo xtask ablate` docs/ablation.png; docs/fleet.png is from what
+    /// `GETUP_FLEET_RECORD=1 cargo xtask bench fleet` writes. A figure without a run is left out, and said to be. The
+    /// first time installs matplotlib into .native/plots/.
     Plot,
     /// Print a Markdown table of the runs in `docs/runs/`: env steps and minutes to each mark.
     Runs,

@@ -291,6 +291,7 @@ fn check_spec(ours: &RunSpec, theirs: Option<v1::RunSpec>, metrics: &ReplayMetri
     let status = match parsed.map(|theirs| ours.check_same(&theirs)) {
         Ok(Ok(())) => return Ok(()),
         Ok(Err(differs)) => Status::failed_precondition(differs.to_string()),
+        Err(other @ SpecError::Protocol { .. }) => Status::failed_precondition(other.to_string()),
         Err(malformed) => Status::invalid_argument(malformed.to_string()),
     };
     metrics.reject("spec");
