@@ -406,7 +406,7 @@ fn source(replay: &str, shutdown: &Shutdown) -> ShardedSource {
     let options = RemoteOptions {
         endpoint: Endpoint::default(),
         spec: get_up_spec(),
-        sample: SampleOptions { batch: BATCH, n_step: 5, gamma: 0.97, seed: 1 },
+        sample: SampleOptions { batch: BATCH, n_step: 5, gamma: 0.97, seed: 1, segments: false },
         name: "learner".to_owned(),
         table: String::new(),
         prefetch: PREFETCH,

@@ -369,7 +369,7 @@ fn episode(writer: u64, number: u64) -> Vec<Segment> {
 /// Transitions sampled a second, and p50 and p99 of the seconds between minibatches.
 fn sample(runtime: &Runtime, endpoint: &str, spec: &RunSpec, batch: usize) -> Result<(f64, [f64; 2])> {
     let options = RemoteOptions {
-        endpoint: endpoint.to_owned(),
+        endpoint: endpoint.into(),
         spec: spec.clone(),
         sample: SampleOptions { batch, n_step: 1, gamma: 0.97, seed: 1, segments: false },
         name: "benchmark".to_owned(),

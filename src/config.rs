@@ -81,6 +81,10 @@ pub(crate) struct NetworkConfig {
     pub(crate) learner_metrics: String,
     /// See `replay_metrics`.
     pub(crate) actor_metrics: String,
+    /// Connections that a role's gRPC port takes, and from one address: actors behind one address share it.
+    pub(crate) connections: usize,
+    /// See `connections`.
+    pub(crate) connections_per_address: usize,
 }
 
 /// Where this machine reaches a service of this address: one that listens everywhere is here too, under the name that is in
@@ -96,6 +100,12 @@ impl NetworkConfig {
     }
 
     fn validate(&self) -> Result<()> {
+        ensure!(
+            self.connections >= 1 && self.connections_per_address >= 1,
+            "network.connections = {}, network.connections_per_address = {}: at least 1 each",
+            self.connections,
+            self.connections_per_address
+        );
         let replays = self.replays();
         for (index, address) in replays.iter().enumerate() {
             ensure!(
@@ -118,6 +128,8 @@ impl Default for NetworkConfig {
             replay_metrics: local(9401),
             learner_metrics: local(9402),
             actor_metrics: local(0),
+            connections: 1024,
+            connections_per_address: 256,
         }
     }
 }

@@ -39,6 +39,8 @@ pub(crate) struct Role {
     /// What this process shows to others, and wants to be shown.
     pub(crate) credentials: Credentials,
     security: SecurityConfig,
+    /// That a port takes: in all, and from one address.
+    connections: (usize, usize),
     grpc: Metrics,
     /// What `/healthz` says.
     pub(crate) ready: Ready,
@@ -59,6 +61,7 @@ impl Role {
             waits: Waits::new(&registry),
             credentials: Credentials::load(&config.security)?,
             security: config.security.clone(),
+            connections: (config.network.connections, config.network.connections_per_address),
             grpc: Metrics::new(&registry),
             registry,
             shutdown: Shutdown::new(),
@@ -91,8 +94,10 @@ impl Role {
         Ok(listener)
     }
 
-    /// A gRPC port that wants to be shown what the configuration says.
+    /// A gRPC port that wants to be shown what the configuration says, and takes as many connections.
     pub(crate) fn port(&self, limits: Limits) -> Server {
+        let (connections, connections_per_peer) = self.connections;
+        let limits = Limits { connections, connections_per_peer, ..limits };
         Server::new(self.credentials.clone(), limits, self.grpc.clone())
     }
 

@@ -96,6 +96,6 @@ fn read(store: &Path, seen: &mut BTreeMap<(u32, u64, u32), u32>) {
 /// How many segments the actor says were acknowledged, at its end.
 fn acknowledged(log: &str) -> u64 {
     let lines = log.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
-    let ended = lines.filter_map(|line| line["acknowledged"].as_u64()).last();
+    let ended = lines.filter_map(|line| line["acknowledged"].as_u64()).next_back();
     ended.unwrap_or_else(|| panic!("the actor says what was acknowledged:\n{log}"))
 }

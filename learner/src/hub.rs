@@ -17,6 +17,8 @@ use crate::leases::{LeaseError, Leases};
 pub(crate) const ACTOR_LOST: Duration = Duration::from_secs(60);
 /// One that is lost for so long is forgotten.
 const ACTOR_FORGOTTEN: Duration = Duration::from_secs(600);
+/// How often those are looked for: not at every heartbeat, or the work would grow with the square of their number.
+const SWEEP: Duration = Duration::from_secs(1);
 /// Policies of which it is known when they were published.
 const PUBLISHED: usize = 1024;
 
@@ -77,6 +79,8 @@ struct State {
     standing: Standing,
     /// Counters of the newest policies, oldest first, and when they came.
     published: VecDeque<(u64, Instant)>,
+    /// When forgotten actors were last looked for.
+    swept: Instant,
 }
 
 /// What the learner knows of an actor, as of its last heartbeat.
@@ -115,6 +119,7 @@ impl Hub {
             actors: BTreeMap::new(),
             standing: Standing::default(),
             published: VecDeque::new(),
+            swept: Instant::now(),
         };
         Self {
             spec,
@@ -195,7 +200,10 @@ impl Hub {
         }
         let lease = if request.idle { self.lease(&mut state, &name, now) } else { None };
         state.actors.insert(name, ActorEntry { heartbeat: request, seen: now });
-        state.actors.retain(|_, actor| now.duration_since(actor.seen) < ACTOR_FORGOTTEN);
+        if now.duration_since(state.swept) >= SWEEP {
+            state.actors.retain(|_, actor| now.duration_since(actor.seen) < ACTOR_FORGOTTEN);
+            state.swept = now;
+        }
         Ok(v1::HeartbeatReply { lease })
     }
 

@@ -137,7 +137,6 @@ impl Cluster {
     }
 
     /// Starts a role; it joins the others, whoever came first.
-
     pub(crate) fn start(&self, role: &'static str, omega: f64) -> Process {
         Process::start(role, self.path(), self.command(role, omega).args(["--log-format", "json"]))
     }

@@ -36,11 +36,9 @@ fn keys_are_for_their_owner_alone() {
         Issued::Peer,
         "the authority is found again"
     );
-    let mode = |name: &str| {
-        folder.path().join("new/folder").join(name).metadata().unwrap().permissions().mode() & 0o777
-    };
-    assert_eq!([mode("ca.key"), mode("peer.key")], [0o600, 0o600]);
-    assert_eq!(mode("peer.pem") & 0o600, 0o600);
+    let mode = |path: std::path::PathBuf| path.metadata().unwrap().permissions().mode() & 0o777;
+    assert_eq!([mode(vault.join("ca.key")), mode(new.join("peer.key"))], [0o600, 0o600]);
+    assert_eq!(mode(new.join("peer.pem")) & 0o600, 0o600);
 }
 
 #[test]
