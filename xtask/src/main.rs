@@ -78,6 +78,13 @@ enum Command {
     /// `GETUP_FLEET_RECORD=1 cargo xtask bench fleet` writes. A figure without a run is left out, and said to be. The
     /// first time installs matplotlib into .native/plots/.
     Plot,
+    /// Draw the Grafana dashboards as pictures in `docs/dashboards/`, from the Prometheus of a running cluster.
+    ///
+    /// First start a cluster (deploy/compose.yaml says how) and let it train for some minutes; its Prometheus is at
+    /// http://127.0.0.1:9090 unless GETUP_PROMETHEUS_PORT says otherwise. Grafana is not needed. Each dashboard of
+    /// deploy/grafana/dashboards/ becomes docs/dashboards/NAME.png; a panel that no data answers is said to be empty.
+    /// The first time installs matplotlib into .native/plots/.
+    Dashboards(plot::Args),
     /// Print a Markdown table of the runs in `docs/runs/`: env steps and minutes to each mark.
     Runs,
 }
@@ -121,6 +128,7 @@ fn main() -> Result<()> {
             ablate::ablate(&args)
         }
         Command::Plot => plot::figures(),
+        Command::Dashboards(args) => plot::dashboards(&args),
         Command::Runs => plot::table(),
     }
 }

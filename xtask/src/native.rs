@@ -38,7 +38,7 @@ const PEER_REQUIREMENTS: &[&str] = &["torch==2.11.0", "numpy==2.3.5"];
 /// What `benches/replay.rs` compares with, in an environment of its own: it needs an older NumPy.
 const REVERB_REQUIREMENTS: &[&str] =
     &["dm-reverb[tensorflow]==0.14.0", "tensorflow==2.15.1", "numpy==1.26.4"];
-/// What `docs/curves.py` draws with; tomli reads TOML where Python does not yet.
+/// What `docs/curves.py` and `docs/dashboards.py` draw with; tomli reads TOML where Python does not yet.
 const PLOT_REQUIREMENTS: &[&str] = &["matplotlib==3.10.9", "tomli==2.5.0; python_version < '3.11'"];
 
 /// The variables that tell build scripts where the libraries are, and the folder of each in `.native`.
