@@ -12,11 +12,11 @@ use getup_telemetry::{Shutdown, WaitGuard, Waits};
 use tokio::runtime::Handle;
 use tokio::sync::{mpsc, watch};
 
+use crate::error::ActorError;
 use crate::evaluate::{EvaluateError, Evaluator};
 use crate::lanes::{LaneGroup, LaneSettings};
 use crate::link::{EpisodeResult, Lease, PolicyUpdate};
 use crate::queue::QueueInput;
-use crate::worker::ActorError;
 
 /// One thread of an actor, before it runs.
 pub(crate) struct LaneThread {

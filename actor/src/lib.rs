@@ -16,6 +16,7 @@
 
 pub mod config;
 mod divergence;
+mod error;
 pub mod evaluate;
 pub mod explore;
 pub mod grpc;
@@ -32,6 +33,7 @@ mod spread;
 pub mod worker;
 
 pub use config::{ActorConfig, ConfigError};
+pub use error::ActorError;
 pub use evaluate::{EvaluateError, EvaluatedEpisode, Evaluator};
 pub use explore::BetaDraw;
 pub use grpc::{GrpcLearner, GrpcReplay};
@@ -43,4 +45,4 @@ pub use link::{
 };
 pub use metrics::ActorMetrics;
 pub use segments::{LayoutError, SegmentBuilder, StepEnd, StepRecord};
-pub use worker::{ActorError, ActorSetup, run};
+pub use worker::{ActorSetup, run};

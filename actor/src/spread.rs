@@ -13,9 +13,9 @@ use getup_telemetry::prometheus::Histogram;
 use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinSet;
 
+use crate::error::ActorError;
 use crate::link::SegmentWriter;
 use crate::queue::{Acknowledgements, QueueOutput};
-use crate::worker::ActorError;
 
 /// Takes segments from `queue` until its inputs are gone, and appends each by one of `writers`; tasks of `tasks` do it.
 pub(crate) fn spread<W: SegmentWriter>(

@@ -9,18 +9,17 @@ use std::time::Duration;
 use getup_proto::RunSpec;
 use getup_sim::{GetUp, SimError, TaskConfig};
 use getup_telemetry::{Registry, Shutdown, Waits};
-use thiserror::Error;
 use tokio::runtime::Handle;
 use tokio::sync::{mpsc, watch};
-use tokio::task::{JoinError, JoinSet};
+use tokio::task::JoinSet;
 
-use crate::config::{ActorConfig, ConfigError};
-use crate::evaluate::EvaluateError;
+use crate::config::ActorConfig;
+use crate::error::ActorError;
 use crate::explore::BetaDraw;
 use crate::identity::Identity;
 use crate::lane_thread::{EvaluationDesk, LaneThread};
-use crate::lanes::{GroupError, LaneSettings};
-use crate::link::{LearnerLink, LinkError, PolicyUpdate, SegmentWriter};
+use crate::lanes::LaneSettings;
+use crate::link::{LearnerLink, PolicyUpdate, SegmentWriter};
 use crate::metrics::ActorMetrics;
 use crate::office::Office;
 use crate::queue::{QueueInput, queue};
@@ -41,29 +40,6 @@ pub struct ActorSetup {
     pub beta: BetaDraw,
     /// Where the states of diverged episodes are kept.
     pub diverged_folder: PathBuf,
-}
-
-/// Why an actor cannot go on.
-#[derive(Debug, Error)]
-pub enum ActorError {
-    /// A setting of the actor.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
-    /// A setting of the task.
-    #[error(transparent)]
-    Sim(#[from] SimError),
-    /// The spec or the policy does not fit the task.
-    #[error(transparent)]
-    Group(#[from] GroupError),
-    /// A leased evaluation cannot be played here.
-    #[error("cannot play a leased evaluation: {0}")]
-    Evaluate(#[from] EvaluateError),
-    /// The replay or the learner refuses this actor.
-    #[error("refused by the {0}")]
-    Refused(LinkError),
-    /// A defect of this program.
-    #[error("a thread of the actor panicked: {0}")]
-    Panicked(#[from] JoinError),
 }
 
 /// Runs an actor until `shutdown`, which then takes up to `drain_seconds`. Its segments are spread over `writers`, each

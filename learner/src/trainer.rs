@@ -206,8 +206,8 @@ impl Trainer {
         source: &mut dyn MinibatchSource,
         shutdown: &Shutdown,
     ) -> Result<Ending, TrainError> {
+        let mut asked = Instant::now();
         while self.ending.is_none() && !shutdown.is_triggered() {
-            let asked = Instant::now();
             match source.poll(STARVED) {
                 Ok(Some(minibatch)) => {
                     self.metrics.wait_seconds.observe(asked.elapsed().as_secs_f64());
@@ -215,6 +215,7 @@ impl Trainer {
                     if !priorities.is_empty() {
                         source.update_priorities(priorities)?;
                     }
+                    asked = Instant::now();
                 }
                 Ok(None) => self.take_reports()?,
                 Err(SampleError::Shutdown) => break,

@@ -4,6 +4,9 @@ use crate::selector::ItemSelector;
 use getup_proto::RunSpec;
 use serde::{Deserialize, Serialize};
 
+/// The table of a stream that names none.
+pub const DEFAULT_TABLE: &str = "default";
+
 /// What an acknowledged segment survives.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

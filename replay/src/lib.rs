@@ -49,7 +49,7 @@ mod tables;
 #[path = "../tests/fixtures/mod.rs"]
 mod fixtures;
 
-pub use config::{ConfigError, MAX_CAPACITY, ReplayConfig, SyncMode};
+pub use config::{ConfigError, DEFAULT_TABLE, MAX_CAPACITY, ReplayConfig, SyncMode};
 pub use error::StoreError;
 pub use export::{DatasetId, ExportError, Exported, export_minari, export_npz};
 pub use log::{Ever, Rewritten, Survey, WriterMark, compact, repair, segments};
@@ -64,4 +64,4 @@ pub use service::{ServeError, limits, serve, serve_at};
 pub use shards::ShardedSource;
 pub use source::{LocalSource, MinibatchSource, SampleError};
 pub use store::Store;
-pub use tables::{DEFAULT_TABLE, TableError, Tables, check_table_name};
+pub use tables::{TableError, Tables, check_table_name};

@@ -1,7 +1,7 @@
 //! What `/metrics` says of a replay: [`ReplayMetrics`], all names `getup_replay_…`.
 
+use crate::config::DEFAULT_TABLE;
 use crate::disk::Disk;
-use crate::tables::DEFAULT_TABLE;
 use getup_telemetry::prometheus::{
     Gauge, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry, core::Collector,
     exponential_buckets,

@@ -117,6 +117,7 @@ impl RemoteSource {
             updates,
             queued: 0,
             reason: reason.clone(),
+            explained: false,
             bell,
             streams: 0,
         };
@@ -257,6 +258,8 @@ struct Fetching {
     /// Minibatches in the queue.
     queued: usize,
     reason: Reason,
+    /// Whether the reason is one in particular.
+    explained: bool,
     bell: Option<Bell>,
     /// Streams opened so far.
     streams: u64,
@@ -326,6 +329,11 @@ impl Fetching {
                     Ok(Some(reply)) => {
                         backoff.reset();
                         asked_why.reset();
+                        // What was waited for has come.
+                        if std::mem::take(&mut self.explained) {
+                            self.explain(self.awaited());
+                            self.explained = false;
+                        }
                         if let Err(end) = self.enqueue(reply) {
                             return end;
                         }
@@ -365,8 +373,7 @@ impl Fetching {
                 _ = asked_why.tick(), if self.queued == 0 => {
                     if let Ok(described) = ask(ReplayClient::new(channel.clone()), &self.options.table).await {
                         let waiting = described.limiter.map(|limiter| limiter.waiting).unwrap_or_default();
-                        let default = || format!("minibatches from replay at {}", self.options.endpoint.address);
-                        self.explain(if waiting.is_empty() { default() } else { waiting });
+                        self.explain(if waiting.is_empty() { self.awaited() } else { waiting });
                     }
                 },
             }
@@ -425,8 +432,14 @@ impl Fetching {
         }
     }
 
-    fn explain(&self, reason: String) {
+    fn explain(&mut self, reason: String) {
         *lock(&self.reason) = reason;
+        self.explained = true;
+    }
+
+    /// The reason where there is none in particular.
+    fn awaited(&self) -> String {
+        format!("minibatches from replay at {}", self.options.endpoint.address)
     }
 }
 

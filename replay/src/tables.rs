@@ -3,12 +3,10 @@
 //! A table is a store of its own: with its spec, its sampler, its limiter, its folder and its committing thread. What
 //! they share is the address, and the names by which streams choose between them.
 
+use crate::config::DEFAULT_TABLE;
 use crate::store::Store;
 use std::collections::BTreeMap;
 use std::sync::Arc;
-
-/// The table of a stream that names none.
-pub const DEFAULT_TABLE: &str = "default";
 
 /// Stores by name; one is there whatever happens, and is called [`DEFAULT_TABLE`].
 #[derive(Clone, Debug)]

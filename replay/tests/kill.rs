@@ -1,4 +1,5 @@
-//! kill -9 under load: every acknowledged segment is there, and none twice.
+//! The service as a process of its own, killed under load and on a slow disk: every acknowledged segment is there, and none
+//! twice.
 
 mod common;
 mod fixtures;
@@ -35,7 +36,16 @@ fn serves_until_it_is_killed() {
 }
 
 fn start(dir: &Path) -> (Child, String) {
-    let mut child = Command::new(std::env::current_exe().unwrap())
+    start_with(dir, None)
+}
+
+/// Starts the process, with a library before all others.
+fn start_with(dir: &Path, library: Option<&Path>) -> (Child, String) {
+    let mut command = Command::new(std::env::current_exe().unwrap());
+    if let Some(library) = library {
+        command.env("LD_PRELOAD", library);
+    }
+    let mut child = command
         .args(["--exact", "serves_until_it_is_killed", "--nocapture"])
         .env(DIR, dir)
         .stdout(Stdio::piped())
@@ -117,6 +127,66 @@ fn every_acknowledged_segment_survives_a_kill_under_load_and_none_is_stored_twic
         assert!(counters.sampled >= sampled, "kill {kill}: samples were forgotten");
     }
     assert!(total() > kills);
+}
+
+/// Makes every write of segments to a file take a twentieth of a second; those of the watermark's few bytes stay in memory.
+const SLOW_WRITES: &str = r#"
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+static void wait_for(int file, size_t count) {
+    struct stat facts;
+    if (count > 64 && fstat(file, &facts) == 0 && S_ISREG(facts.st_mode)) usleep(50000);
+}
+
+ssize_t write(int file, const void *bytes, size_t count) {
+    static ssize_t (*real)(int, const void *, size_t);
+    if (!real) real = (ssize_t (*)(int, const void *, size_t))dlsym(RTLD_NEXT, "write");
+    wait_for(file, count);
+    return real(file, bytes, count);
+}
+
+ssize_t pwrite64(int file, const void *bytes, size_t count, off_t at) {
+    static ssize_t (*real)(int, const void *, size_t, off_t);
+    if (!real) real = (ssize_t (*)(int, const void *, size_t, off_t))dlsym(RTLD_NEXT, "pwrite64");
+    wait_for(file, count);
+    return real(file, bytes, count, at);
+}
+"#;
+
+#[test]
+fn a_slow_disk_holds_up_writers_and_not_samplers_and_loses_nothing() {
+    let dir = TempDir::new().unwrap();
+    let (source, library) = (dir.path().join("slow.c"), dir.path().join("slow.so"));
+    std::fs::write(&source, SLOW_WRITES).unwrap();
+    let compiled =
+        Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&library).arg(&source).arg("-ldl").status();
+    assert!(compiled.unwrap().success());
+    let store = dir.path().join("store");
+    let (mut child, endpoint) = start_with(&store, Some(&library));
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let acknowledged = Arc::new(AtomicU64::new(0));
+    let writing = runtime.spawn(write(endpoint.clone(), 1, acknowledged.clone()));
+    let mut source = sampler(&endpoint, &runtime);
+    let started = Instant::now();
+    let (mut minibatches, mut steps, mut last) = (0, 0, 0);
+    while started.elapsed() < Duration::from_millis(1_500) {
+        minibatches += u64::from(source.poll(Duration::from_millis(5)).unwrap().is_some());
+        let now = acknowledged.load(Ordering::SeqCst);
+        steps += u64::from(now > last);
+        last = now;
+    }
+    // Thirty writes at most: the disk is slow, segments share commits, and samples come all the while.
+    assert!((1..=75).contains(&steps), "{steps} times something was acknowledged");
+    assert!(last > 60, "{last} segments were acknowledged");
+    assert!(minibatches > 200, "{minibatches} minibatches meanwhile");
+    child.kill().unwrap();
+    child.wait().unwrap();
+    runtime.block_on(writing).unwrap();
+    let store = open(&store, &spec(STEPS), &config()).unwrap();
+    assert!(store.introduce(1, "actor") >= acknowledged.load(Ordering::SeqCst));
 }
 
 fn sampler(endpoint: &str, runtime: &tokio::runtime::Runtime) -> RemoteSource {

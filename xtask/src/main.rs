@@ -108,6 +108,7 @@ fn main() -> Result<()> {
             native::set_up(false)?;
             prerequisites::install_debian_packages()?;
             if !cluster {
+                native::set_up_readers()?;
                 tasks::test(full)?;
             }
             tasks::test_cluster(full || cluster)

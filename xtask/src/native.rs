@@ -38,6 +38,8 @@ const PEER_REQUIREMENTS: &[&str] = &["torch==2.11.0", "numpy==2.3.5"];
 /// What `benches/replay.rs` compares with, in an environment of its own: it needs an older NumPy.
 const REVERB_REQUIREMENTS: &[&str] =
     &["dm-reverb[tensorflow]==0.14.0", "tensorflow==2.15.1", "numpy==1.26.4"];
+/// What exported stores are read with, in tests.
+const READER_REQUIREMENTS: &[&str] = &["minari[arrow]==0.5.4", "numpy==2.2.6"];
 /// What `docs/curves.py` and `docs/dashboards.py` draw with; tomli reads TOML where Python does not yet.
 const PLOT_REQUIREMENTS: &[&str] = &["matplotlib==3.10.9", "tomli==2.5.0; python_version < '3.11'"];
 
@@ -63,6 +65,11 @@ pub(crate) fn reverb_python() -> PathBuf {
 /// The Python of the peers' environment.
 pub(crate) fn peers_python() -> PathBuf {
     native().join("peers/bin/python")
+}
+
+/// The Python that has NumPy and Minari.
+pub(crate) fn readers_python() -> PathBuf {
+    native().join("readers/bin/python")
 }
 
 /// The Python of the plots' environment.
@@ -96,6 +103,16 @@ pub(crate) fn set_up_peers() -> Result<()> {
 pub(crate) fn set_up_plots() -> Result<()> {
     prerequisites::check()?;
     set_up_environment("plots", &plots_python(), PLOT_REQUIREMENTS, "matplotlib for the figures (200 MB)")
+}
+
+/// Makes the environment that tests read exported stores in.
+pub(crate) fn set_up_readers() -> Result<()> {
+    set_up_environment(
+        "readers",
+        &readers_python(),
+        READER_REQUIREMENTS,
+        "NumPy and Minari for the tests (300 MB)",
+    )
 }
 
 /// Makes a Python environment in `.native/NAME`, where it is missing or of other requirements.

@@ -5,7 +5,7 @@ use std::process::Command;
 
 use anyhow::{Context, Result, bail};
 
-use crate::native::{self, peers_python, reverb_python, root, run};
+use crate::native::{self, peers_python, readers_python, reverb_python, root, run};
 
 /// Cargo, in the root of the repository.
 pub(crate) fn cargo() -> Command {
@@ -40,7 +40,7 @@ pub(crate) fn train(arguments: &[String]) -> Result<()> {
 /// The tests; `full` adds the long forms, which read `GETUP_TEST_FULL`.
 pub(crate) fn test(full: bool) -> Result<()> {
     let mut command = cargo();
-    command.args(["test", "--release", "--workspace"]);
+    command.args(["test", "--release", "--workspace"]).env("GETUP_TEST_PYTHON", readers_python());
     if full {
         command.env("GETUP_TEST_FULL", "1");
     }

@@ -8,10 +8,11 @@ mod append;
 mod committer;
 mod sample;
 
+use crate::config::DEFAULT_TABLE;
 use crate::error::StoreError;
 use crate::metrics::ReplayMetrics;
 use crate::store::Store;
-use crate::tables::{DEFAULT_TABLE, Tables};
+use crate::tables::Tables;
 use append::AppendStream;
 use committer::Job;
 use getup_proto::v1::replay_server::{Replay, ReplayServer};
