@@ -5,11 +5,15 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 /// How often a cluster is asked how it is.
 const TICK: Duration = Duration::from_millis(500);
+/// Between the faults of a soak.
+const PAUSE: Duration = Duration::from_secs(20);
 /// An actor that was heard from more recently takes part.
 const HEARD_SECONDS: f64 = 5.0;
 
@@ -30,6 +34,12 @@ pub(crate) struct Args {
     /// Only faults whose name contains this; may be repeated.
     #[arg(long, value_name = "TEXT")]
     only: Vec<String>,
+    /// Go on for so many minutes with faults drawn at random, twenty seconds apart, instead of each once.
+    #[arg(long, value_name = "MINUTES")]
+    soak: Option<f64>,
+    /// Which faults a soak draws.
+    #[arg(long, default_value_t = 0, requires = "soak")]
+    seed: u64,
     /// List the faults and break nothing.
     #[arg(long)]
     list: bool,
@@ -96,11 +106,11 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     }
     ensure!(
         arguments.yes,
-        "this breaks the cluster {} times, on purpose: say --yes to do it, --list to see how",
+        "this breaks the cluster, on purpose, in {} ways: say --yes to do it, --list to see how",
         faults.len()
     );
     let mut failed = 0;
-    for fault in faults {
+    for fault in sequence(faults, arguments.soak, arguments.seed) {
         let outcome = plan.try_fault(fault);
         failed += usize::from(!outcome.passed);
         if arguments.json {
@@ -115,6 +125,17 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     }
     ensure!(failed == 0, "the cluster did not come through {failed} of its faults");
     Ok(())
+}
+
+/// Every fault once; or for some minutes one at random after another, with a pause before each.
+fn sequence(faults: Vec<&Fault>, soak: Option<f64>, seed: u64) -> Box<dyn Iterator<Item = &Fault> + '_> {
+    let Some(minutes) = soak else { return Box::new(faults.into_iter()) };
+    let until = Instant::now() + Duration::from_secs_f64(60.0 * minutes.clamp(0.0, 1e6));
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    Box::new(std::iter::from_fn(move || {
+        std::thread::sleep(PAUSE);
+        (Instant::now() < until).then(|| faults[rng.random_range(0..faults.len())])
+    }))
 }
 
 impl Plan {

@@ -12,6 +12,7 @@ mod tasks;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
+use tasks::Cluster;
 
 /// Set up, train, test, check, measure and show getup.
 #[derive(Parser)]
@@ -111,7 +112,11 @@ fn main() -> Result<()> {
                 native::set_up_readers()?;
                 tasks::test(full)?;
             }
-            tasks::test_cluster(full || cluster)
+            tasks::test_cluster(match (full, cluster) {
+                (true, _) => Cluster::Soak,
+                (false, true) => Cluster::AllFaults,
+                (false, false) => Cluster::OneFault,
+            })
         }
         Command::Check => {
             native::set_up(false)?;

@@ -47,8 +47,18 @@ pub(crate) fn test(full: bool) -> Result<()> {
     run(&mut command)
 }
 
+/// How a cluster of containers is tested.
+pub(crate) enum Cluster {
+    /// Within minutes.
+    OneFault,
+    /// Each once.
+    AllFaults,
+    /// And then half an hour of them.
+    Soak,
+}
+
 /// `deploy/test`: containers of this build, their metrics, and faults; where there is a Docker engine.
-pub(crate) fn test_cluster(full: bool) -> Result<()> {
+pub(crate) fn test_cluster(part: Cluster) -> Result<()> {
     let works = |arguments: &[&str]| {
         let (program, arguments) = arguments.split_first().expect("a program");
         Command::new(program).args(arguments).output().is_ok_and(|output| output.status.success())
@@ -57,9 +67,19 @@ pub(crate) fn test_cluster(full: bool) -> Result<()> {
         println!("skipped: the cluster of containers needs root, a Docker engine and docker-compose");
         return Ok(());
     }
-    let getup = build()?;
-    let mut command = Command::new(root().join("deploy/test"));
-    run(command.args(full.then_some("--full")).env("GETUP", getup))
+    // The tests before have built it; a build of this package alone would make its dependencies anew, with fewer features.
+    let getup = match part {
+        Cluster::AllFaults => build()?,
+        Cluster::OneFault | Cluster::Soak => root().join("target/release/getup"),
+    };
+    let test = |arguments: &[&str]| {
+        run(Command::new(root().join("deploy/test")).args(arguments).env("GETUP", &getup))
+    };
+    match part {
+        Cluster::OneFault => test(&[]),
+        Cluster::AllFaults => test(&["--full"]),
+        Cluster::Soak => test(&["--full"]).and_then(|()| test(&["--soak", "30"])),
+    }
 }
 
 /// Format, clippy (with and without the learner) and documentation, all without a warning.
