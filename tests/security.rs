@@ -54,8 +54,10 @@ fn with_certificates_the_roles_train_and_whoever_has_none_or_others_is_refused_a
     wait_for("updates are made", LIMIT, || {
         cluster.learner_metric("updates_total").filter(|updates| *updates >= 20.0)
     });
-    let status = succeed(&mut command(&cluster, "status", &tls(&ours)));
-    assert!(status.contains("learner  training"), "{status}");
+    // What a role says of itself is up to a second old, and between updates a learner may wait.
+    wait_for("the status says so", LIMIT, || {
+        succeed(&mut command(&cluster, "status", &tls(&ours))).contains("learner  training").then_some(())
+    });
 
     let before = refused(&cluster, "handshake");
     for settings in [Vec::new(), tls(&others)] {
