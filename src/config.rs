@@ -10,7 +10,7 @@ use getup_actor::config::ActorConfig;
 use getup_actor::explore::BetaDraw;
 use getup_learner::config::{CurriculumConfig, EvaluationConfig, LearnerConfig, SacConfig};
 use getup_proto::{ColumnSpec, Rows, RunSpec, columns};
-use getup_replay::{ItemSelector, ReplayConfig, SyncMode};
+use getup_replay::{ItemSelector, Remover, ReplayConfig, SyncMode};
 use getup_sim::{GetUp, Task, TaskConfig};
 use getup_transport::SecurityConfig;
 use serde::{Deserialize, Serialize};
@@ -49,18 +49,21 @@ pub(crate) struct Config {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub(crate) struct ReplayTable {
-    /// Transitions that can be sampled; the oldest go first.
+    /// Transitions that can be sampled.
     pub(crate) capacity: usize,
     /// Transitions are drawn in proportion to their last error to this power; 0 draws them all alike.
     pub(crate) priority_exponent: f64,
     /// What an acknowledged segment survives: `process` (a kill) or `data` (a power loss too).
     pub(crate) sync: SyncMode,
+    /// What leaves when there are more: `fifo`, the oldest, or `{ lowest_priority = { window = 4 } }`, what has the lowest
+    /// priorities; the log then keeps `window` times the capacity.
+    pub(crate) remover: Remover,
 }
 
 impl Default for ReplayTable {
     fn default() -> Self {
-        let ReplayConfig { capacity, sync, .. } = ReplayConfig::default();
-        Self { capacity, priority_exponent: 0.0, sync }
+        let ReplayConfig { capacity, remover, sync, .. } = ReplayConfig::default();
+        Self { capacity, priority_exponent: 0.0, sync, remover }
     }
 }
 
@@ -258,6 +261,7 @@ impl Config {
                 exponent => ItemSelector::Prioritized { exponent },
             },
             max_times_sampled: None,
+            remover: self.replay.remover,
         }
     }
 
@@ -367,6 +371,23 @@ mod tests {
         let config = config.unwrap();
         assert_eq!((config.sac.batch, config.seed, config.run.as_str()), (32, 7, "arms"));
         assert_eq!((config.sac.hidden, config.sac.target_entropy.nats(21)), (vec![8, 8], -4.0));
+    }
+
+    #[test]
+    fn what_leaves_a_full_replay_is_a_setting_and_stays_one_in_the_runs_folder() {
+        let by_priority =
+            ["replay.priority_exponent=0.6", "replay.remover={ lowest_priority = { window = 2 } }"];
+        let lowest = Remover::LowestPriority { window: 2 };
+        let config = load(&by_priority, &[]).unwrap();
+        assert_eq!((config.replay.remover, config.replay_config(1).remover), (lowest, lowest));
+        assert_eq!(toml::from_str::<Config>(&config.to_toml().unwrap()).unwrap(), config);
+        // Later layers win, part by part or as a whole.
+        let longer = [by_priority[0], by_priority[1], "replay.remover.lowest_priority.window=8"];
+        let remover = |arguments: &[&str]| load(arguments, &[]).unwrap().replay.remover;
+        assert_eq!(remover(&longer), Remover::LowestPriority { window: 8 });
+        assert_eq!(remover(&[by_priority[1], "replay.remover=fifo"]), Remover::Fifo);
+        let refused = format!("{:#}", load(&by_priority[1..], &[]).unwrap_err());
+        assert!(refused.contains("or a run's replay.priority_exponent"), "{refused}");
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! The settings of a replay: [`ReplayConfig`].
 
+use crate::remover::{MAX_WINDOW, Remover};
 use crate::selector::ItemSelector;
 use getup_proto::RunSpec;
 use serde::{Deserialize, Serialize};
@@ -22,7 +23,7 @@ pub enum SyncMode {
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReplayConfig {
-    /// Transitions that can be sampled at once; the oldest go first.
+    /// Transitions that can be sampled at once.
     pub capacity: usize,
     /// Env steps that must have come before the first sample; limp steps do not count.
     pub min_size: u64,
@@ -39,6 +40,8 @@ pub struct ReplayConfig {
     /// How often a transition may be drawn, from 1; without it, any number of times. Counts begin anew at a restart.
     /// With 1 and `fifo` the store is a queue.
     pub max_times_sampled: Option<u32>,
+    /// Which segments leave when there are more.
+    pub remover: Remover,
 }
 
 impl Default for ReplayConfig {
@@ -51,6 +54,7 @@ impl Default for ReplayConfig {
             sync: SyncMode::Process,
             sampler: ItemSelector::Uniform,
             max_times_sampled: None,
+            remover: Remover::Fifo,
         }
     }
 }
@@ -84,6 +88,18 @@ pub enum ConfigError {
     /// The exponent of priorities is no number from 0.
     #[error("replay.sampler.prioritized.exponent is {0}: it must lie in 0..=10 (0.6 is usual)")]
     Exponent(f64),
+    /// `remover` goes by priorities, and there are none.
+    #[error(
+        "replay.remover is lowest_priority, and transitions have no priorities to go by: draw them by priority, with an \
+         exponent above 0 (a table's sampler.prioritized.exponent, or a run's replay.priority_exponent), or leave \
+         replay.remover out"
+    )]
+    NoPriorities,
+    /// The window of `remover` is out of range.
+    #[error(
+        "replay.remover.lowest_priority.window is {0}: it must lie in 1..={MAX_WINDOW}, how many times the capacity the log keeps"
+    )]
+    Window(u32),
     /// Nothing could ever be drawn.
     #[error("replay.max_times_sampled is 0: it must be 1 or more; leave it out for no limit")]
     MaxTimesSampled,
@@ -131,6 +147,11 @@ impl ReplayConfig {
         self.check(spec.max_segment_steps)
     }
 
+    /// Transitions that the log keeps.
+    pub(crate) fn kept(&self) -> u64 {
+        self.capacity as u64 * u64::from(self.remover.window())
+    }
+
     fn check(&self, max_segment_steps: usize) -> Result<(), ConfigError> {
         let min = 2 * max_segment_steps;
         if !(min..=MAX_CAPACITY).contains(&self.capacity) {
@@ -143,6 +164,14 @@ impl ReplayConfig {
             && !(0.0..=10.0).contains(&exponent)
         {
             return Err(ConfigError::Exponent(exponent));
+        }
+        if let Remover::LowestPriority { window } = self.remover {
+            if !(1..=MAX_WINDOW).contains(&window) {
+                return Err(ConfigError::Window(window));
+            }
+            if !matches!(self.sampler, ItemSelector::Prioritized { exponent } if exponent > 0.0) {
+                return Err(ConfigError::NoPriorities);
+            }
         }
         if self.max_times_sampled == Some(0) {
             return Err(ConfigError::MaxTimesSampled);
@@ -185,6 +214,17 @@ mod tests {
         assert!(refused(&|c| c.max_times_sampled = Some(0)).contains("max_times_sampled is 0"));
         let steep = refused(&|c| c.sampler = ItemSelector::Prioritized { exponent: f64::NAN });
         assert!(steep.contains("exponent is NaN"), "{steep}");
+        let lowest = |window| Remover::LowestPriority { window };
+        for sampler in
+            [ItemSelector::Uniform, ItemSelector::Fifo, ItemSelector::Prioritized { exponent: 0.0 }]
+        {
+            let nothing = refused(&|c| (c.remover, c.sampler) = (lowest(4), sampler));
+            assert!(nothing.contains("no priorities to go by: draw them by priority"), "{nothing}");
+        }
+        for window in [0, 65] {
+            let far = refused(&|c| c.remover = lowest(window));
+            assert!(far.contains(&format!("lowest_priority.window is {window}")), "{far}");
+        }
         let runs_out = refused(&|c| {
             c.samples_per_insert = Some(2.0);
             c.max_times_sampled = Some(1);

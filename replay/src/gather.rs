@@ -7,11 +7,11 @@
 //! discount = γᵏ, or 0 if step t+k−1 ended in a terminal state
 //! ```
 //!
-//! k is n, or less where the episode ends or the ring does not hold what follows. So a one-step target is
+//! k is n, or less where the episode ends or the ring does not hold what follows: not yet, or not any more. So a one-step target is
 //! `reward + discount × V(next)` whatever n is. The sum runs over neighbouring segments of the episode.
 
 use crate::minibatch::{MinibatchColumn, SampleOptions};
-use crate::ring::{Drawn, Entry, LayoutColumn, Ring, Row};
+use crate::ring::{Drawn, Entry, LayoutColumn, Ring};
 use getup_proto::{Rows, columns};
 use std::ops::Range;
 
@@ -30,7 +30,7 @@ struct Transition {
 pub(crate) fn gather(ring: &Ring, drawn: &[Drawn], options: &SampleOptions) -> Vec<MinibatchColumn> {
     let reward = ring.layout().columns.iter().find(|column| column.name == columns::REWARD);
     let reward = reward.map(|column| column.at.start);
-    let span = |drawn: &Drawn| span(ring, drawn.row, reward, options.n_step, options.gamma);
+    let span = |drawn: &Drawn| span(ring, drawn.slot, reward, options.n_step, options.gamma);
     let transitions: Vec<Transition> = drawn.iter().map(span).collect();
 
     let layout = &ring.layout().columns;
@@ -55,16 +55,14 @@ pub(crate) fn gather_segments(ring: &Ring, drawn: &[Drawn]) -> Vec<MinibatchColu
     let column = |column: &LayoutColumn| {
         let mut data = Vec::new();
         for drawn in drawn {
-            let entry = ring.entry_of(drawn.row);
+            let entry = ring.entry_of(drawn.slot);
             let rows = match column.rows {
                 Rows::Once => 1,
                 Rows::Steps => entry.steps,
                 Rows::StepsPlusOne => entry.steps + 1,
             };
-            let mut slot = ring.slot(entry.first_row);
-            for _ in 0..rows {
+            for slot in ring.slots().walk(entry.slot, rows) {
                 data.extend_from_slice(&ring.values(slot)[column.at.clone()]);
-                slot = ring.slot_after(slot);
             }
         }
         MinibatchColumn { name: column.name.clone(), width: column.at.len(), data }
@@ -72,11 +70,10 @@ pub(crate) fn gather_segments(ring: &Ring, drawn: &[Drawn]) -> Vec<MinibatchColu
     ring.layout().columns.iter().map(column).collect()
 }
 
-/// Follows up to `n` steps of the episode from the row `begin`; `reward` is the place of the reward in a row.
-fn span(ring: &Ring, begin: Row, reward: Option<usize>, n: usize, gamma: f32) -> Transition {
-    let slot = ring.slot(begin);
-    let mut transition = Transition { begin: slot, end: slot, reward: 0.0, discount: 1.0 };
-    let steps = ring.steps_from(slot);
+/// Follows up to `n` steps of the episode from the row in slot `begin`; `reward` is the place of the reward in a row.
+fn span(ring: &Ring, begin: usize, reward: Option<usize>, n: usize, gamma: f32) -> Transition {
+    let mut transition = Transition { begin, end: begin, reward: 0.0, discount: 1.0 };
+    let steps = ring.steps_from(begin);
     transition.follow(ring, steps.min(n), reward, gamma);
     if n >= steps {
         transition.cross_segments(ring, ring.entry_of(begin), n - steps, reward, gamma);
@@ -92,7 +89,7 @@ impl Transition {
                 self.reward += self.discount * ring.values(self.end)[place];
             }
             self.discount *= gamma;
-            self.end = ring.slot_after(self.end);
+            self.end = ring.slots().after(self.end);
         }
     }
 
@@ -110,7 +107,7 @@ impl Transition {
             && let Some(continuation) = ring.continuation(entry)
         {
             entry = continuation;
-            self.end = ring.slot(entry.first_row);
+            self.end = entry.slot;
             let steps = entry.steps.min(left);
             self.follow(ring, steps, reward, gamma);
             left -= steps;

@@ -1,7 +1,9 @@
 use super::*;
 use crate::config::ReplayConfig;
 use crate::fixtures::{self, Ending, Part};
+use crate::remover::Remover;
 use crate::sampler::Sampler;
+use crate::selector::ItemSelector;
 use getup_proto::Segment;
 use proptest::prelude::*;
 
@@ -58,7 +60,7 @@ proptest! {
         }
         for (number, (lane, t)) in (0..).zip(steps) {
             let row = ring.nth_row(number);
-            if ring.steps_from(ring.slot(row)) == 0 {
+            if ring.steps_from(row) == 0 {
                 continue;
             }
             let (length, ending) = lengths[lane as usize];
@@ -68,6 +70,68 @@ proptest! {
             prop_assert!((got.discount - discount).abs() < 1e-6);
             prop_assert_eq!(observation(&ring, got.begin), fixtures::value(1, lane, 0, t, 0, 0));
             prop_assert_eq!(observation(&ring, got.end), fixtures::value(1, lane, 0, end, 0, 0));
+        }
+    }
+}
+
+proptest! {
+    #[test]
+    fn a_transition_ends_where_the_segment_that_follows_was_removed(
+        lengths in prop::collection::vec((1usize..40, prop_oneof![
+            Just(Ending::None), Just(Ending::Terminal), Just(Ending::Truncated)]), 1..6),
+        cut in 1usize..=8,
+        n in 1usize..=20,
+        removed in prop::collection::vec(prop::bool::weighted(0.3), 200),
+    ) {
+        let (capacity, spec) = (2000, fixtures::spec(8));
+        let sampler = ItemSelector::Prioritized { exponent: 1.0 };
+        let remover = Remover::LowestPriority { window: 8 };
+        let mut ring = Ring::new(&spec, &ReplayConfig { capacity, sampler, remover, ..ReplayConfig::default() });
+        let segments = episodes(&lengths, cut);
+        segments.iter().for_each(|segment| ring.push(segment));
+        // Others fill the ring, and leave after those that are to be removed and before those that are not.
+        let mut others = (1..).map(|i| fixtures::segment(&spec, 2, i, 8));
+        let (mut key, ours) = (0, ring.len() as u64);
+        ring.push(&others.next().unwrap());
+        while ring.len() + 8 <= capacity && ring.slots().free() > 8 {
+            ring.push(&others.next().unwrap());
+        }
+        for key in ours..ring.len() as u64 {
+            prop_assert!(ring.set_priority(key, 0.5));
+        }
+        let mut gone = Vec::new();
+        let mut there = std::collections::HashSet::new();
+        for (segment, removed) in segments.iter().zip(removed) {
+            if removed {
+                (key..).take(segment.steps).for_each(|key| assert!(ring.set_priority(key, 0.0)));
+                gone.push(key);
+            } else {
+                there.extend((0..segment.steps).map(|step| (segment.lane, segment.first_step as usize + step)));
+            }
+            key += segment.steps as u64;
+        }
+        while gone.iter().any(|&key| ring.set_priority(key, 0.0)) {
+            ring.push(&others.next().unwrap());
+        }
+        let mut key = 0;
+        for segment in &segments {
+            let (lane, (length, ending)) = (segment.lane, lengths[segment.lane as usize]);
+            for t in (segment.first_step as usize..).take(segment.steps) {
+                key += 1;
+                if !there.contains(&(lane, t)) {
+                    prop_assert!(!ring.set_priority(key - 1, 1.0));
+                    continue;
+                }
+                let begin = ring.slot_of(key - 1).unwrap();
+                let held = (t..length).find(|&t| !there.contains(&(lane, t))).unwrap_or(length);
+                let got = span(&ring, begin, Some(reward_place(&ring)), n, GAMMA);
+                let terminal = ending == Ending::Terminal && held == length;
+                let (reward, discount, end) = reference(lane, t, n, held, terminal);
+                prop_assert!((got.reward - reward).abs() < 1e-5);
+                prop_assert!((got.discount - discount).abs() < 1e-6, "{} and not {}", got.discount, discount);
+                prop_assert_eq!(observation(&ring, got.begin), fixtures::value(1, lane, 0, t, 0, 0));
+                prop_assert_eq!(observation(&ring, got.end), fixtures::value(1, lane, 0, end, 0, 0));
+            }
         }
     }
 }

@@ -12,7 +12,8 @@
 //! | --- | --- |
 //! | `store` | [`Store`]: the parts below, put together |
 //! | `log` | the durable log: commits, eviction, recovery, snapshots, repair |
-//! | `ring` | the newest transitions in memory |
+//! | `ring`, `slots` | the transitions in memory, and where in memory |
+//! | `remover` | [`Remover`]: which segments leave a full ring: the oldest, or those of the lowest priority |
 //! | `gather` | from drawn rows to contiguous columns, with n-step returns |
 //! | `selector`, `sum_tree` | [`ItemSelector`]: which transitions are drawn: uniform, prioritized, FIFO, LIFO |
 //! | `sampler` | [`Sampler`]: whose random numbers decide |
@@ -35,11 +36,13 @@ mod log;
 mod metrics;
 mod minibatch;
 mod remote;
+mod remover;
 mod ring;
 mod sampler;
 mod selector;
 mod service;
 mod shards;
+mod slots;
 mod source;
 mod store;
 mod sum_tree;
@@ -58,6 +61,7 @@ pub use minibatch::{
     Item, MAX_N_STEP, Minibatch, MinibatchColumn, OptionsError, ReplayCounters, SampleOptions, SampledSegment,
 };
 pub use remote::{RemoteOptions, RemoteSource, describe, describe_table, take_snapshot, update_priorities};
+pub use remover::Remover;
 pub use sampler::Sampler;
 pub use selector::ItemSelector;
 pub use service::{ServeError, limits, serve, serve_at};

@@ -4,65 +4,58 @@
 //! observation before it, its action, its reward, and the episode's β̂; the last row holds the final observation
 //! alone. So a transition is two neighbouring rows, no next state is stored twice, and sampling one touches one
 //! place in memory. In front of each row stands how many steps follow it in its segment, which is all that most
-//! samples need to know of the segment. Rows are numbered from the first ever pushed and lie in a buffer that wraps
-//! around.
+//! samples need to know of the segment. [`Slots`] says where in the buffer rows lie.
 //!
-//! The oldest segments leave, whole, when a new one would exceed the capacity. What is in the ring is therefore a
-//! function of the segments pushed most recently, however many were pushed before: a ring that is rebuilt from
-//! the log equals the one that was lost.
+//! Segments leave, whole, when a new one would exceed the capacity: the oldest, or those of the lowest priority. Where
+//! the oldest leave, what is in the ring is a function of the segments pushed most recently, however many were pushed
+//! before: a ring that is rebuilt from the log equals the one that was lost. Where priorities decide, a rebuilt ring
+//! begins with the newest segments, as none has a priority yet.
 
 use crate::config::ReplayConfig;
 use crate::minibatch::SampledSegment;
+use crate::remover::{Lowest, Remover};
 use crate::selector::Selector;
+use crate::slots::Slots;
 use getup_proto::{ColumnSpec, Rows, RunSpec, Segment, columns};
 use rand::Rng;
 use std::collections::{HashMap, VecDeque};
 use std::ops::Range;
 
-/// A row, by its number since the ring began.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) struct Row(u64);
-
-impl Row {
-    /// Counts from the first row ever pushed.
-    #[cfg(test)]
-    pub(crate) fn number(self) -> u64 {
-        self.0
-    }
-}
-
-/// The newest transitions, up to a capacity.
+/// The transitions that can be sampled, up to a capacity.
 #[derive(Debug)]
 pub(crate) struct Ring {
     layout: Layout,
     /// Transitions that may be in the ring.
     capacity: usize,
-    /// Transitions that are.
+    /// Transitions since a segment began, after which it leaves at the latest: as many as the log keeps.
+    window: u64,
+    /// Transitions that are in the ring.
     transitions: usize,
-    /// Row after row.
+    /// A row in each slot.
     values: Vec<f32>,
-    /// Rows that `values` has room for.
-    slots: usize,
+    slots: Slots,
+    /// The segments from the oldest on that is in the ring; those after it that have left keep their place, with no
+    /// steps.
     segments: VecDeque<Entry>,
     /// Number of the oldest segment.
     first_segment: u64,
-    /// Numbers of the rows in the ring.
-    live: Range<u64>,
-    /// Slot of the oldest row.
-    first_slot: usize,
+    /// None where the oldest leave first.
+    lowest: Option<Lowest>,
     /// The newest segment of each episode that may go on.
     unfinished: HashMap<Lane, u64>,
     /// None where any row may be drawn any number of times.
     selector: Option<Selector>,
-    /// Key of the next transition that is pushed: the transitions ever stored before it.
-    next_key: u64,
+    /// Transitions ever pushed.
+    pushed: u64,
+    /// Transitions that were stored before the first of these.
+    stored_before: u64,
 }
 
 /// A transition that was drawn.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(crate) struct Drawn {
-    /// Where it begins.
-    pub(crate) row: Row,
+    /// Slot of the row where it begins.
+    pub(crate) slot: usize,
     /// With which it was drawn.
     pub(crate) probability: f64,
 }
@@ -90,13 +83,15 @@ type Lane = (u64, u32);
 /// A segment in the ring.
 #[derive(Clone, Debug)]
 pub(crate) struct Entry {
-    pub(crate) first_row: Row,
-    /// Key of its first transition.
-    first_key: u64,
+    /// Of its first row.
+    pub(crate) slot: usize,
+    /// Transitions pushed before its first.
+    pushed_before: u64,
+    /// 0 where it has left.
     pub(crate) steps: usize,
     pub(crate) terminal: bool,
     truncated: bool,
-    /// Number of the segment that continues the episode.
+    /// Number of the segment that continues the episode; it may have left.
     continued_by: Option<u64>,
     lane: Lane,
     episode: u64,
@@ -105,7 +100,7 @@ pub(crate) struct Entry {
 }
 
 impl Ring {
-    /// An empty ring for `config.capacity` transitions, drawn as `config` says. Memory is taken as it fills.
+    /// An empty ring for `config.capacity` transitions, drawn and removed as `config` says. Memory is taken as it fills.
     pub(crate) fn new(spec: &RunSpec, config: &ReplayConfig) -> Self {
         let capacity = config.capacity;
         let layout = Layout::new(spec);
@@ -114,41 +109,32 @@ impl Ring {
         let slots = capacity + capacity / 8 + spec.max_segment_steps + 1;
         Self {
             values: vec![0.0; slots * layout.stride],
-            slots,
+            slots: Slots::new(slots, config.remover == Remover::Fifo),
             layout,
             capacity,
+            window: config.kept(),
             transitions: 0,
             segments: VecDeque::new(),
             first_segment: 0,
-            live: 0..0,
-            first_slot: 0,
+            lowest: (config.remover != Remover::Fifo).then(Lowest::default),
             unfinished: HashMap::new(),
             selector: Selector::new(config.sampler, config.max_times_sampled, slots),
-            next_key: 0,
+            pushed: 0,
+            stored_before: 0,
         }
     }
 
-    /// Adds a segment that follows the ring's spec, and drops the oldest ones to make room.
+    /// Adds a segment that follows the ring's spec, and removes others to make room.
     pub(crate) fn push(&mut self, segment: &Segment) {
-        let rows = segment.steps as u64 + 1;
-        while self.transitions + segment.steps > self.capacity || self.rows() + rows > self.slots as u64 {
-            self.evict();
-        }
+        self.make_room(segment.steps);
         let number = self.first_segment + self.segments.len() as u64;
-        let first_row = Row(self.live.end);
-        self.live.end += rows;
-        self.write_rows(first_row, segment);
-        if let Some(selector) = &mut self.selector {
-            for step in 0..segment.steps as u64 {
-                let slot = self.first_slot + (first_row.0 + step - self.live.start) as usize;
-                selector.insert(slot % self.slots);
-            }
-        }
+        let slot = self.slots.take(segment.steps + 1, number);
+        self.write_rows(slot, segment);
         self.link(number, segment);
         self.transitions += segment.steps;
         self.segments.push_back(Entry {
-            first_row,
-            first_key: self.next_key,
+            slot,
+            pushed_before: self.pushed,
             steps: segment.steps,
             terminal: segment.terminal,
             truncated: segment.truncated,
@@ -157,7 +143,11 @@ impl Ring {
             episode: segment.episode,
             next_step: u64::from(segment.first_step) + segment.steps as u64,
         });
-        self.next_key += segment.steps as u64;
+        self.pushed += segment.steps as u64;
+        if let Some(selector) = &mut self.selector {
+            self.slots.walk(slot, segment.steps).for_each(|slot| selector.insert(slot));
+        }
+        self.weigh(slot);
     }
 
     /// Transitions in the ring.
@@ -166,8 +156,8 @@ impl Ring {
     }
 
     /// Rows in the ring.
-    pub(crate) fn rows(&self) -> u64 {
-        self.live.end - self.live.start
+    pub(crate) fn rows(&self) -> usize {
+        self.slots.rows()
     }
 
     /// Bytes that a full ring takes.
@@ -177,9 +167,7 @@ impl Ring {
 
     /// Numbers the transitions so that so many were ever stored: keys are the same after a restart.
     pub(crate) fn set_stored(&mut self, transitions: u64) {
-        let shift = transitions - self.next_key;
-        self.next_key = transitions;
-        self.segments.iter_mut().for_each(|entry| entry.first_key += shift);
+        self.stored_before = transitions - self.pushed;
     }
 
     /// Whether draws leave a trace, or depend on more than the rows: [`Ring::draw`] then, and not
@@ -193,16 +181,16 @@ impl Ring {
         if self.transitions == 0 { Some(0) } else { self.selector.as_ref().and_then(Selector::available) }
     }
 
-    /// Draws a transition, each with the same probability.
+    /// Draws a transition, each with the same probability, where the oldest segments leave first.
     ///
     /// # Panics
     /// If the ring is empty.
     pub(crate) fn draw_uniformly(&self, rng: &mut impl Rng) -> Drawn {
         loop {
             // Rows are uniform, and so are those of them that begin a transition: all but one a segment.
-            let row = self.nth_row(rng.random_range(0..self.rows()));
-            if self.steps_from(self.slot(row)) > 0 {
-                return Drawn { row, probability: 1.0 / self.transitions as f64 };
+            let slot = self.nth_row(rng.random_range(0..self.rows()));
+            if self.steps_from(slot) > 0 {
+                return Drawn { slot, probability: 1.0 / self.transitions as f64 };
             }
         }
     }
@@ -213,38 +201,44 @@ impl Ring {
     /// If there is none that can be drawn.
     pub(crate) fn draw(&mut self, rng: &mut impl Rng) -> Drawn {
         let Some(selector) = &mut self.selector else { return self.draw_uniformly(rng) };
-        let (slot, probability) = selector.draw(rng, self.first_slot);
-        let from_oldest = (slot + self.slots - self.first_slot) % self.slots;
-        Drawn { row: Row(self.live.start + from_oldest as u64), probability }
+        let (slot, probability) = selector.draw(rng, self.slots.nth(0));
+        // What can be drawn no more counts for nothing.
+        if selector.weight(slot) == 0.0 {
+            self.weigh(slot);
+        }
+        Drawn { slot, probability }
     }
 
-    /// What names a transition for as long as it is stored, also after a restart.
-    pub(crate) fn key(&self, row: Row) -> u64 {
-        let entry = self.entry_of(row);
-        entry.first_key + (row.0 - entry.first_row.0)
+    /// What names the transition that begins in `slot` for as long as it is stored, also after a restart.
+    pub(crate) fn key(&self, slot: usize) -> u64 {
+        let entry = self.entry_of(slot);
+        self.stored_before + entry.pushed_before + (entry.steps - self.steps_from(slot)) as u64
     }
 
     /// Gives a transition a priority; false if it is gone, or priorities do not count.
     pub(crate) fn set_priority(&mut self, key: u64, priority: f32) -> bool {
-        let Some(place) = self.segments.partition_point(|entry| entry.first_key <= key).checked_sub(1) else {
-            return false;
-        };
-        let entry = &self.segments[place];
-        let step = key - entry.first_key;
-        if step >= entry.steps as u64 {
-            return false;
-        }
-        let slot = self.slot(Row(entry.first_row.0 + step));
-        self.selector.as_mut().is_some_and(|selector| selector.set_priority(slot, priority))
+        let (Some(slot), Some(selector)) = (self.slot_of(key), &mut self.selector) else { return false };
+        let given = selector.set_priority(slot, priority);
+        self.weigh(slot);
+        given
+    }
+
+    /// The slot of the row where the transition begins that this key names, where it is there.
+    pub(crate) fn slot_of(&self, key: u64) -> Option<usize> {
+        let nth = key.checked_sub(self.stored_before)?;
+        let after = self.segments.partition_point(|entry| entry.pushed_before <= nth);
+        let entry = &self.segments[after.checked_sub(1)?];
+        let step = (nth - entry.pushed_before) as usize;
+        (step < entry.steps).then(|| self.slots.ahead(entry.slot, step))
     }
 
     pub(crate) fn layout(&self) -> &Layout {
         &self.layout
     }
 
-    /// The `n`th of the rows in the ring, from the oldest.
-    pub(crate) fn nth_row(&self, n: u64) -> Row {
-        Row(self.live.start + n)
+    /// The slot of the `n`th of the rows in the ring, from the oldest, where the oldest segments leave first.
+    pub(crate) fn nth_row(&self, n: usize) -> usize {
+        self.slots.nth(n)
     }
 
     /// Steps of the row's segment from the row in `slot` on; a transition begins where there are some.
@@ -252,14 +246,14 @@ impl Ring {
         self.values[slot * self.layout.stride] as usize
     }
 
-    /// The segment that a row belongs to.
-    pub(crate) fn entry_of(&self, row: Row) -> &Entry {
-        &self.segments[self.segments.partition_point(|entry| entry.first_row.0 <= row.0) - 1]
+    /// The segment that the row in `slot` belongs to.
+    pub(crate) fn entry_of(&self, slot: usize) -> &Entry {
+        &self.segments[self.place_of(slot)]
     }
 
-    /// The segment that a row belongs to, as samplers are told of it.
-    pub(crate) fn segment_of(&self, row: Row) -> SampledSegment {
-        let entry = self.entry_of(row);
+    /// The segment that the row in `slot` belongs to, as samplers are told of it.
+    pub(crate) fn segment_of(&self, slot: usize) -> SampledSegment {
+        let entry = self.entry_of(slot);
         SampledSegment {
             writer: entry.lane.0,
             lane: entry.lane.1,
@@ -273,18 +267,13 @@ impl Ring {
 
     /// The segment that continues the episode, where it is there.
     pub(crate) fn continuation(&self, entry: &Entry) -> Option<&Entry> {
-        entry.continued_by.map(|number| &self.segments[(number - self.first_segment) as usize])
+        let number = entry.continued_by?;
+        // It came later than the entry, and the places of those that came before it are kept.
+        self.segments.get((number - self.first_segment) as usize).filter(|entry| entry.steps > 0)
     }
 
-    /// Where in the buffer a row lies.
-    pub(crate) fn slot(&self, row: Row) -> usize {
-        let slot = self.first_slot + (row.0 - self.live.start) as usize;
-        if slot < self.slots { slot } else { slot - self.slots }
-    }
-
-    /// The slot of the row after the one in `slot`.
-    pub(crate) fn slot_after(&self, slot: usize) -> usize {
-        if slot + 1 == self.slots { 0 } else { slot + 1 }
+    pub(crate) fn slots(&self) -> &Slots {
+        &self.slots
     }
 
     /// The values of the row in `slot`.
@@ -292,24 +281,68 @@ impl Ring {
         &self.values[slot * self.layout.stride..][..self.layout.stride]
     }
 
-    fn evict(&mut self) {
-        let entry = self.segments.pop_front().expect("a ring has room for its longest segment");
-        if let Some(selector) = &mut self.selector {
-            (0..entry.steps).for_each(|step| selector.remove((self.first_slot + step) % self.slots));
+    /// Removes segments until one of so many steps has room.
+    fn make_room(&mut self, steps: usize) {
+        let pushed = self.pushed + steps as u64;
+        while self.segments.front().is_some_and(|oldest| oldest.pushed_before + self.window < pushed) {
+            self.remove(self.first_segment);
         }
-        self.transitions -= entry.steps;
-        self.live.start += entry.steps as u64 + 1;
-        self.first_slot = (self.first_slot + entry.steps + 1) % self.slots;
-        if self.unfinished.get(&entry.lane) == Some(&self.first_segment) {
-            self.unfinished.remove(&entry.lane);
+        while self.transitions + steps > self.capacity || steps + 1 > self.slots.free() {
+            let lowest = self.lowest.as_ref().and_then(Lowest::first);
+            self.remove(lowest.unwrap_or(self.first_segment));
         }
-        self.first_segment += 1;
     }
 
-    fn write_rows(&mut self, first_row: Row, segment: &Segment) {
+    fn remove(&mut self, number: u64) {
+        let entry = self.segments.get_mut((number - self.first_segment) as usize);
+        let entry = entry.expect("a ring has room for its longest segment");
+        let (slot, steps, lane) = (entry.slot, std::mem::take(&mut entry.steps), entry.lane);
+        if let Some(selector) = &mut self.selector {
+            self.slots.walk(slot, steps).for_each(|slot| selector.remove(slot));
+        }
+        if let Some(lowest) = &mut self.lowest {
+            lowest.remove(number);
+        }
+        self.slots.give_back(slot, steps + 1);
+        self.transitions -= steps;
+        if self.unfinished.get(&lane) == Some(&number) {
+            self.unfinished.remove(&lane);
+        }
+        while self.segments.front().is_some_and(|entry| entry.steps == 0) {
+            self.segments.pop_front();
+            self.first_segment += 1;
+        }
+    }
+
+    /// Finds where the segment that the row in `slot` belongs to comes in the order in which priorities make segments
+    /// leave, when the weights of its transitions have changed.
+    fn weigh(&mut self, slot: usize) {
+        if self.lowest.is_none() {
+            return;
+        }
+        let place = self.place_of(slot);
+        if let (Some(lowest), Some(selector)) = (&mut self.lowest, &self.selector) {
+            let entry = &self.segments[place];
+            let weights = self.slots.walk(entry.slot, entry.steps).map(|slot| selector.weight(slot));
+            lowest.set(self.first_segment + place as u64, weights.fold(0.0, f64::max));
+        }
+    }
+
+    /// The place of the segment that the row in `slot` belongs to.
+    fn place_of(&self, slot: usize) -> usize {
+        match &self.slots {
+            Slots::InOrder(order) => {
+                let age = order.age(slot);
+                self.segments.partition_point(|entry| order.age(entry.slot) <= age) - 1
+            }
+            Slots::Linked(linked) => (linked.segment(slot) - self.first_segment) as usize,
+        }
+    }
+
+    /// Writes the rows of the segment whose first is in `slot`.
+    fn write_rows(&mut self, slot: usize, segment: &Segment) {
         let stride = self.layout.stride;
-        let mut slot = self.slot(first_row);
-        for step in 0..=segment.steps {
+        for (step, slot) in self.slots.walk(slot, segment.steps + 1).enumerate() {
             let row = &mut self.values[slot * stride..][..stride];
             // A segment has at most 2^16 steps: exact.
             row[0] = (segment.steps - step) as f32;
@@ -323,7 +356,6 @@ impl Ring {
                 let row_bytes = column.at.len() * columns::VALUE_BYTES;
                 columns::decode_into(&bytes[from * row_bytes..][..row_bytes], &mut row[column.at.clone()]);
             }
-            slot = self.slot_after(slot);
         }
     }
 

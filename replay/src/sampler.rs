@@ -62,13 +62,14 @@ mod tests {
         for (i, steps) in [8, 1, 3, 8, 2, 5].into_iter().cycle().take(60).enumerate() {
             ring.push(&fixtures::segment(&spec, 1, i as u64 + 1, steps));
         }
-        let mut counts = vec![0; ring.rows() as usize];
+        let rows: Vec<usize> = (0..ring.rows()).map(|n| ring.nth_row(n)).collect();
+        let mut counts = vec![0; rows.iter().max().unwrap() + 1];
         let mut sampler = Sampler::new(3);
         for drawn in sampler.draw_uniformly(&ring, 200_000) {
-            counts[(drawn.row.number() - ring.nth_row(0).number()) as usize] += 1;
+            counts[drawn.slot] += 1;
         }
-        let begins = |i: &usize| ring.steps_from(ring.slot(ring.nth_row(*i as u64))) > 0;
-        let drawn: Vec<u32> = (0..counts.len()).filter(begins).map(|i| counts[i]).collect();
+        let begin = rows.into_iter().filter(|&slot| ring.steps_from(slot) > 0);
+        let drawn: Vec<u32> = begin.map(|slot| counts[slot]).collect();
         assert_eq!(drawn.len(), ring.len());
         assert_eq!(drawn.iter().sum::<u32>(), 200_000);
         assert!(deviation(&drawn).abs() < 4.0, "{} standard deviations", deviation(&drawn));

@@ -78,6 +78,11 @@ impl Selector {
         }
     }
 
+    /// With what weight a transition is drawn: 0 where it cannot be.
+    pub(crate) fn weight(&self, slot: usize) -> f64 {
+        self.weights.weight(slot)
+    }
+
     /// How many draws are left before transitions must come; None where there is no limit.
     pub(crate) fn available(&self) -> Option<u64> {
         (!self.left.is_empty()).then_some(self.available)

@@ -328,7 +328,7 @@ impl Store {
             self.gate.set_available(memory.ring.available());
             let ring = &memory.ring;
             let item =
-                |drawn: &Drawn| Item { key: ring.key(drawn.row), probability: drawn.probability as f32 };
+                |drawn: &Drawn| Item { key: ring.key(drawn.slot), probability: drawn.probability as f32 };
             let items = drawn.iter().map(item).collect();
             (found(ring, &drawn, options), items, memory.state, ring.len())
         } else {
@@ -449,7 +449,7 @@ fn found(
     options: &SampleOptions,
 ) -> (Vec<MinibatchColumn>, Vec<SampledSegment>) {
     if options.segments {
-        (gather_segments(ring, drawn), drawn.iter().map(|drawn| ring.segment_of(drawn.row)).collect())
+        (gather_segments(ring, drawn), drawn.iter().map(|drawn| ring.segment_of(drawn.slot)).collect())
     } else {
         (gather(ring, drawn, options), Vec::new())
     }

@@ -1,4 +1,4 @@
-//! Random sequences of appends, samples, evictions and restarts, against a plain list in memory.
+//! Random sequences of appends, samples, priorities, removals and restarts, against a plain list in memory.
 
 mod common;
 mod fixtures;
@@ -6,9 +6,10 @@ mod fixtures;
 use common::{config, open};
 use fixtures::{Ending, Part, spec};
 use getup_proto::Segment;
-use getup_replay::{ReplayConfig, SampleOptions, Sampler, Store, compact, segments};
+use getup_replay::{ItemSelector, Remover, ReplayConfig, SampleOptions, Sampler, Store, compact, segments};
 use proptest::prelude::*;
-use std::collections::{HashMap, VecDeque};
+use proptest::sample::Index;
+use std::collections::HashMap;
 use tempfile::TempDir;
 
 const STEPS: usize = 8;
@@ -18,25 +19,56 @@ enum Action {
     /// A group commit of these lengths, by these writers; some repeat an old sequence number.
     Append(Vec<(u64, usize, bool)>),
     Sample(usize, usize),
+    /// Priorities for transitions, counted from the newest ever stored.
+    Prioritize(Vec<(Index, f32)>),
     Restart,
     Compact,
 }
 
 fn action() -> impl Strategy<Value = Action> {
     let part = (1u64..4, 1..=STEPS, prop::bool::weighted(0.2));
+    let priority = prop_oneof![Just(0.0), Just(0.5), Just(1.0), 0.0f32..2.0];
     prop_oneof![
         6 => prop::collection::vec(part, 1..12).prop_map(Action::Append),
         3 => (1usize..40, 1usize..4).prop_map(|(batch, n_step)| Action::Sample(batch, n_step)),
+        3 => prop::collection::vec((any::<Index>(), priority), 1..40).prop_map(Action::Prioritize),
         1 => Just(Action::Restart),
         1 => Just(Action::Compact),
     ]
 }
 
+fn settings() -> impl Strategy<Value = ReplayConfig> {
+    let lowest_priority = (1u32..6).prop_map(|window| Remover::LowestPriority { window });
+    let remover = prop_oneof![Just(Remover::Fifo), lowest_priority];
+    ((2 * STEPS)..200, remover).prop_map(|(capacity, remover)| {
+        let sampler = match remover {
+            Remover::Fifo => ItemSelector::Uniform,
+            Remover::LowestPriority { .. } => ItemSelector::Prioritized { exponent: 0.7 },
+        };
+        ReplayConfig { capacity, sampler, remover, ..config() }
+    })
+}
+
+/// A segment that can be sampled.
+struct Held {
+    segment: Segment,
+    /// Of its first transition.
+    key: u64,
+    /// Of all its transitions. Equal ones leave first in, first out.
+    priorities: Vec<f32>,
+}
+
 /// What a store should be.
-#[derive(Default)]
 struct Model {
+    capacity: usize,
+    /// Transitions that the log keeps.
+    kept: u64,
     /// What can be sampled.
-    held: VecDeque<Segment>,
+    held: Vec<Held>,
+    /// Every segment that was ever stored.
+    history: Vec<Segment>,
+    /// The greatest priority that was given.
+    newest: f32,
     durable: HashMap<u64, u64>,
     env_steps: u64,
     transitions: u64,
@@ -45,30 +77,77 @@ struct Model {
 }
 
 impl Model {
-    fn append(&mut self, segment: &Segment, capacity: usize) {
+    fn new(settings: &ReplayConfig) -> Self {
+        let window = match settings.remover {
+            Remover::Fifo => 1,
+            Remover::LowestPriority { window } => u64::from(window),
+        };
+        Self {
+            capacity: settings.capacity,
+            kept: window * settings.capacity as u64,
+            held: Vec::new(),
+            history: Vec::new(),
+            newest: 1.0,
+            durable: HashMap::new(),
+            env_steps: 0,
+            transitions: 0,
+            episodes: 0,
+            sampled: 0,
+        }
+    }
+
+    fn append(&mut self, segment: &Segment) {
         let durable = self.durable.entry(segment.writer).or_default();
         if segment.sequence <= *durable {
             return;
         }
         *durable = segment.sequence;
         self.env_steps += u64::from(segment.env_steps);
-        self.transitions += segment.steps as u64;
         self.episodes += u64::from(segment.end.is_some());
-        self.held.push_back(segment.clone());
+        self.history.push(segment.clone());
+        self.hold(segment.clone());
+    }
+
+    fn hold(&mut self, segment: Segment) {
+        let (key, steps, capacity) = (self.transitions, segment.steps, self.capacity);
+        self.transitions += steps as u64;
+        self.held.retain(|held| held.key + self.kept >= self.transitions);
         // Rows run out before transitions do where segments are short: see the ring.
-        let rows = |held: &VecDeque<Segment>| held.iter().map(|segment| segment.steps + 1).sum::<usize>();
-        while self.size() > capacity || rows(&self.held) > capacity + capacity / 8 + STEPS + 1 {
-            self.held.pop_front();
+        let rows = |model: &Self| model.size() + model.held.len();
+        while self.size() + steps > capacity || rows(self) + steps + 1 > capacity + capacity / 8 + STEPS + 1 {
+            let greatest = |held: &Held| held.priorities.iter().copied().fold(0.0, f32::max);
+            let lowest = self.held.iter().map(greatest).fold(f32::MAX, f32::min);
+            let first = self.held.iter().position(|held| greatest(held) == lowest).unwrap();
+            self.held.remove(first);
+        }
+        self.held.push(Held { segment, key, priorities: vec![self.newest; steps] });
+    }
+
+    /// Begins again with no priorities, from the log.
+    fn restart(&mut self) {
+        (self.newest, self.transitions) = (1.0, 0);
+        self.held.clear();
+        for segment in self.history.clone() {
+            self.hold(segment);
         }
     }
 
+    /// Whether the transition was there to get it.
+    fn prioritize(&mut self, key: u64, priority: f32) -> bool {
+        let of = |held: &&mut Held| (held.key..held.key + held.priorities.len() as u64).contains(&key);
+        let Some(held) = self.held.iter_mut().find(of) else { return false };
+        held.priorities[(key - held.key) as usize] = priority;
+        self.newest = self.newest.max(priority);
+        true
+    }
+
     fn size(&self) -> usize {
-        self.held.iter().map(|segment| segment.steps).sum()
+        self.held.iter().map(|held| held.segment.steps).sum()
     }
 
     /// Whether this is the observation before some step that can be sampled, with that step's action.
     fn holds(&self, observation: &[f32], action: &[f32]) -> bool {
-        self.held.iter().any(|segment| {
+        self.held.iter().any(|Held { segment, .. }| {
             let row = |column: usize, width: usize, step: usize| -> Vec<f32> {
                 let values = getup_proto::columns::iter(&segment.columns[column]);
                 values.skip(step * width).take(width).collect()
@@ -136,19 +215,18 @@ proptest! {
     #[test]
     fn a_store_is_what_a_plain_list_says(
         actions in prop::collection::vec(action(), 1..60),
-        capacity in (2 * STEPS)..200,
+        settings in settings(),
     ) {
         let dir = TempDir::new().unwrap();
-        let settings = ReplayConfig { capacity, ..config() };
         let mut store = open(dir.path(), &spec(STEPS), &settings).unwrap();
-        let (mut model, mut writers, mut sampler) = (Model::default(), Writers::default(), Sampler::new(1));
+        let (mut model, mut writers, mut sampler) = (Model::new(&settings), Writers::default(), Sampler::new(1));
         for action in actions {
             match action {
                 Action::Append(parts) => {
                     let group: Vec<Segment> =
                         parts.into_iter().map(|(writer, steps, again)| writers.segment(writer, steps, again)).collect();
                     store.append(group.clone()).unwrap();
-                    group.iter().for_each(|segment| model.append(segment, capacity));
+                    group.iter().for_each(|segment| model.append(segment));
                 }
                 Action::Sample(batch, n_step) => {
                     let options = SampleOptions { batch, n_step, gamma: 0.9, seed: 0, segments: false };
@@ -163,13 +241,28 @@ proptest! {
                         prop_assert!(model.holds(observation, action), "{:?} is in no segment", observation);
                     }
                 }
+                Action::Prioritize(priorities) if model.transitions > 0 => {
+                    let back = |index: Index| index.index(model.transitions.min(2 * model.kept) as usize) as u64;
+                    let by_key = |(index, priority)| (model.transitions - 1 - back(index), priority);
+                    let priorities: Vec<(u64, f32)> = priorities.into_iter().map(by_key).collect();
+                    let given = store.update_priorities(&priorities).unwrap();
+                    if settings.remover == Remover::Fifo {
+                        prop_assert_eq!(given, 0, "nothing has a priority");
+                    } else {
+                        let there = priorities.into_iter().filter(|&(key, priority)| model.prioritize(key, priority));
+                        prop_assert_eq!(given, there.count() as u64);
+                    }
+                }
+                Action::Prioritize(_) => {}
                 Action::Restart => {
                     drop(store);
+                    model.restart();
                     store = open(dir.path(), &spec(STEPS), &settings).unwrap();
                 }
                 Action::Compact => {
                     drop(store);
-                    compact(dir.path(), Some(capacity as u64)).unwrap();
+                    compact(dir.path(), Some(model.kept)).unwrap();
+                    model.restart();
                     store = open(dir.path(), &spec(STEPS), &settings).unwrap();
                 }
             }
@@ -179,11 +272,15 @@ proptest! {
             prop_assert_eq!(store.introduce(writer, "actor"), sequence);
         }
         drop(store);
-        // The log holds what the ring does, in its order, and at most a sixteenth of the capacity more.
+        // The log holds the end of all that was stored, what can be sampled is in it, and it keeps at most a sixteenth more
+        // than it is to keep.
         let logged: Vec<Segment> = segments(dir.path()).unwrap().1.map(Result::unwrap).collect();
-        let held: Vec<&Segment> = model.held.iter().collect();
-        prop_assert_eq!(logged.iter().rev().take(held.len()).rev().collect::<Vec<_>>(), held);
-        let steps: usize = logged.iter().map(|segment| segment.steps).sum();
-        prop_assert!(steps <= capacity + capacity / 16 + 2 * 12 * STEPS, "{} transitions in the log", steps);
+        prop_assert!(model.history.ends_with(&logged));
+        let mut rest = logged.iter();
+        for Held { segment, .. } in &model.held {
+            prop_assert!(rest.any(|logged| logged == segment), "{:?} is not in the log", segment);
+        }
+        let (steps, kept): (usize, _) = (logged.iter().map(|segment| segment.steps).sum(), model.kept as usize);
+        prop_assert!(steps <= kept + kept / 16 + 2 * 12 * STEPS, "{} transitions in the log", steps);
     }
 }

@@ -29,8 +29,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "DIR")]
     dir: Option<PathBuf>,
     /// A TOML file of further tables, a section each: `[NAME]` with capacity, min_size, samples_per_insert,
-    /// error_buffer, sync, sampler ("uniform", "fifo", "lifo", { prioritized = { exponent = 0.6 } }), max_times_sampled;
-    /// columns and max_segment_steps where they are not the run's.
+    /// error_buffer, sync, sampler ("uniform", "fifo", "lifo", { prioritized = { exponent = 0.6 } }), max_times_sampled,
+    /// remover ("fifo", { lowest_priority = { window = 4 } }); columns and max_segment_steps where they are not the run's.
     #[arg(long, value_name = "FILE")]
     tables: Option<PathBuf>,
 }

@@ -66,7 +66,7 @@ fn parse(text: &str, run: &RunSpec) -> Result<Vec<TableConfig>> {
 mod tests {
     use super::*;
     use getup_proto::Rows;
-    use getup_replay::ItemSelector;
+    use getup_replay::{ItemSelector, Remover};
 
     fn run() -> RunSpec {
         let column = |name: &str, width, rows| ColumnSpec { name: name.to_owned(), width, rows };
@@ -91,6 +91,7 @@ mod tests {
 
             [hard]
             sampler = { prioritized = { exponent = 0.6 } }
+            remover = { lowest_priority = {} }
             max_segment_steps = 16
             columns = [{ name = "observation", width = 5, rows = "steps_plus_one" }]
         "#;
@@ -100,6 +101,8 @@ mod tests {
         assert_eq!((queue.settings.sampler, queue.settings.max_times_sampled), (ItemSelector::Fifo, Some(1)));
         assert_eq!(queue.spec, run());
         assert_eq!(hard.settings.sampler, ItemSelector::Prioritized { exponent: 0.6 });
+        assert_eq!(hard.settings.remover, Remover::LowestPriority { window: 4 });
+        assert_eq!(queue.settings.remover, Remover::Fifo);
         assert_eq!((hard.spec.columns[0].width, hard.spec.max_segment_steps), (5, 16));
     }
 
@@ -110,6 +113,9 @@ mod tests {
             ("[a]\nsize = 3", "unknown field `size`"),
             ("[a]\ncapacity = 3", "replay.capacity is 3"),
             ("[a]\nmax_times_sampled = 0", "max_times_sampled is 0"),
+            ("[a]\nremover = { lowest_priority = {} }", "no priorities to go by"),
+            ("[a]\nremover = { lowest_priority = { windows = 3 } }", "unknown field `windows`"),
+            ("[a]\nremover = \"lifo\"", "unknown variant `lifo`, expected `fifo` or `lowest_priority`"),
             ("a = 3", "a table has settings"),
             ("[a]\ncolumns = []", "no columns"),
             ("[a", "TOML parse error"),

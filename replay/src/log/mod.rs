@@ -1,8 +1,9 @@
 //! The durable log of segments: [`Log`].
 //!
-//! Segments lie in [files] of at most a sixteenth of the capacity, one record after another. A commit is one write at
+//! Segments lie in [files] of at most a sixteenth of what is kept (the capacity, or a window of some capacities: see
+//! [`Remover`](crate::Remover)), one record after another. A commit is one write at
 //! the end of the newest file: when it returns, the kernel has it, and a process that is killed loses nothing. Then
-//! comes the [watermark], and only then the acknowledgement. When the other files hold the capacity the oldest is
+//! comes the [watermark], and only then the acknowledgement. When the other files hold what is to be kept the oldest is
 //! deleted, which gives its space back at once; what only it knew (its writers' marks) goes into the [index]
 //! before.
 //!
@@ -55,7 +56,7 @@ use writers::Writers;
 
 /// What a log consists of, in its store's folder.
 const FOLDERS: [&str; 3] = [files::FOLDER, index::FOLDER, watermark::FILE];
-/// Files that make up the capacity, at least.
+/// Files that make up what is kept, at least.
 const FILES: u64 = 16;
 /// How long to ask for the lock of a store that is held.
 const LOCK_PATIENCE: Duration = Duration::from_secs(1);
@@ -67,7 +68,8 @@ const EVICT_AGAIN: Duration = Duration::from_secs(5);
 pub(crate) struct Log {
     dir: PathBuf,
     store: u64,
-    capacity: u64,
+    /// Transitions that are kept; a few more are there.
+    kept: u64,
     sync: SyncMode,
     /// Oldest first; the last one is the tail's, where there is one.
     files: VecDeque<Held>,
@@ -100,7 +102,7 @@ struct Held {
 
 impl Log {
     /// Opens the store in `dir`, or creates it. Its segments are passed to `replay`, oldest first; the newest
-    /// `config.capacity` transitions are among them, and perhaps some before.
+    /// transitions that it keeps are among them, and perhaps some before.
     pub(crate) fn open(
         dir: &Path,
         spec: &RunSpec,
@@ -125,7 +127,7 @@ impl Log {
         let mut log = Self {
             dir: dir.to_owned(),
             store: manifest.store,
-            capacity: config.capacity as u64,
+            kept: config.kept(),
             sync: config.sync,
             files,
             tail: None,
@@ -243,14 +245,14 @@ impl Log {
         self.watermark.set_acknowledged(state.segments)?;
         let newest = self.files.back_mut().expect("the tail is one of them");
         newest.transitions += state.transitions - self.state.transitions;
-        if newest.transitions >= self.capacity.div_ceil(FILES) || tail.bytes() >= files::FULL_BYTES {
+        if newest.transitions >= self.kept.div_ceil(FILES) || tail.bytes() >= files::FULL_BYTES {
             self.tail = None;
         }
         self.state = state;
         Ok(())
     }
 
-    /// Drops the oldest files while the others hold the capacity. An index that cannot be written leaves them
+    /// Drops the oldest files while the others hold what is to be kept. An index that cannot be written leaves them
     /// for a while: nothing is lost by that but space.
     fn evict(&mut self) {
         let excess = self.excess();
@@ -281,7 +283,7 @@ impl Log {
         let mut held: u64 = self.files.iter().map(|file| file.transitions).sum();
         let fits = |file: &&Held| {
             held -= file.transitions;
-            held >= self.capacity
+            held >= self.kept
         };
         self.files.iter().take_while(fits).count()
     }
