@@ -11,7 +11,7 @@
 //! | [`link`] | [`SegmentWriter`] and [`LearnerLink`], and the typed values that pass through them |
 //! | [`grpc`] | both as gRPC clients |
 //! | `queue`, `spread` | the bounded queue of segments, and its way to one or several replays |
-//! | [`worker`] | [`run`]: the role, with its threads, its queue, heartbeats and shutdown |
+//! | [`worker`] | [`run`]: the role, with its threads, its queue, heartbeats and shutdown; [`run_with`]: with a stub that plays |
 //! | [`config`], [`identity`], [`metrics`] | settings; who an actor is, and its random draws; what it counts |
 
 pub mod config;
@@ -44,5 +44,6 @@ pub use link::{
     SegmentWriter, UpdateError,
 };
 pub use metrics::ActorMetrics;
+pub use queue::QueueInput;
 pub use segments::{LayoutError, SegmentBuilder, StepEnd, StepRecord};
-pub use worker::{ActorSetup, run};
+pub use worker::{ActorSetup, Playing, run, run_with};

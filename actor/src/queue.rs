@@ -21,8 +21,8 @@ pub(crate) fn queue(capacity: usize, metrics: ActorMetrics) -> (QueueInput, Queu
 }
 
 /// Where lanes put segments.
-#[derive(Clone)]
-pub(crate) struct QueueInput {
+#[derive(Clone, Debug)]
+pub struct QueueInput {
     sender: mpsc::UnboundedSender<Segment>,
     /// One permit a segment that still fits.
     room: Arc<Semaphore>,
@@ -32,7 +32,7 @@ pub(crate) struct QueueInput {
 
 impl QueueInput {
     /// Moves segments from the front of `pending` into the queue, as many as fit.
-    pub(crate) fn fill_from(&self, pending: &mut VecDeque<Segment>) {
+    pub fn fill_from(&self, pending: &mut VecDeque<Segment>) {
         while !pending.is_empty()
             && let Ok(permit) = self.room.try_acquire()
             && let Some(segment) = pending.pop_front()
@@ -46,12 +46,12 @@ impl QueueInput {
     }
 
     /// Returns when a segment would fit.
-    pub(crate) async fn room(&self) {
+    pub async fn room(&self) {
         let _ = self.room.acquire().await;
     }
 
     /// Segments that may be unacknowledged.
-    pub(crate) fn capacity(&self) -> usize {
+    pub fn capacity(&self) -> usize {
         self.capacity
     }
 }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use getup_proto::RunSpec;
-use getup_sim::{GetUp, SimError, TaskConfig};
+use getup_sim::{GetUp, TaskConfig};
 use getup_telemetry::{Registry, Shutdown, Waits};
 use tokio::runtime::Handle;
 use tokio::sync::{mpsc, watch};
@@ -19,7 +19,7 @@ use crate::explore::BetaDraw;
 use crate::identity::Identity;
 use crate::lane_thread::{EvaluationDesk, LaneThread};
 use crate::lanes::LaneSettings;
-use crate::link::{LearnerLink, PolicyUpdate, SegmentWriter};
+use crate::link::{EpisodeResult, LearnerLink, Lease, PolicyUpdate, SegmentWriter};
 use crate::metrics::ActorMetrics;
 use crate::office::Office;
 use crate::queue::{QueueInput, queue};
@@ -60,24 +60,42 @@ pub async fn run<W: SegmentWriter, L: LearnerLink>(
     shutdown: Shutdown,
     registry: &Registry,
 ) -> Result<(), ActorError> {
+    run_with(&setup, writers, link, waits, shutdown, registry, |playing| playing.start(&setup)).await
+}
+
+/// As [`run`], with whatever `play` starts in the place of lanes of simulated characters: all else of an actor is the same.
+///
+/// # Errors
+/// As [`run`], and what `play` returns.
+///
+/// # Panics
+/// As [`run`].
+pub async fn run_with<W: SegmentWriter, L: LearnerLink>(
+    setup: &ActorSetup,
+    writers: Vec<W>,
+    link: L,
+    waits: Waits,
+    shutdown: Shutdown,
+    registry: &Registry,
+    play: impl FnOnce(Playing) -> Result<JoinSet<Result<(), ActorError>>, ActorError>,
+) -> Result<(), ActorError> {
     assert!(!writers.is_empty(), "an actor writes somewhere");
     setup.config.validate()?;
     let metrics = ActorMetrics::new(registry, &setup.identity.name);
     let stop = StopOnDrop(Shutdown::new());
     let (slot, updates) = watch::channel(None);
-    let (input, output) = queue(setup.config.queue_segments, metrics.clone());
+    let (queue, output) = queue(setup.config.queue_segments, metrics.clone());
     let (lease_sender, leases) = mpsc::channel(1);
-    let (report_sender, reports) = mpsc::unbounded_channel();
-    let control_limit = setup.beta.ceiling.max(1.0);
-    let desk = EvaluationDesk {
-        task: setup.task.clone(),
-        control_limit,
+    let (reports, report_receiver) = mpsc::unbounded_channel();
+    let mut threads = play(Playing {
+        updates: updates.clone(),
+        queue,
         leases,
-        reports: report_sender,
-        evaluator: None,
-    };
-    let threads = Threads { waits: &waits, stop: &stop.0, updates: &updates, queue: input };
-    let mut threads = threads.start(&setup, control_limit, desk, &metrics)?;
+        reports,
+        waits: waits.clone(),
+        stop: stop.0.clone(),
+        metrics: metrics.clone(),
+    })?;
     let mut writing = JoinSet::new();
     spread(writers, output, &metrics.append_seconds, &mut writing);
     let office = Office::new(&setup.identity.name, &link, updates, waits, metrics.clone());
@@ -88,7 +106,7 @@ pub async fn run<W: SegmentWriter, L: LearnerLink>(
         result = first_error(&mut writing) => result,
         result = subscribe(&link, slot) => result,
         () = office.send_heartbeats(lease_sender) => Ok(()),
-        () = office.send_reports(reports) => Ok(()),
+        () = office.send_reports(report_receiver) => Ok(()),
     };
     stop.0.trigger();
     let result = result.and(first_error_of_all(&mut threads).await);
@@ -110,22 +128,29 @@ impl Drop for StopOnDrop {
     }
 }
 
-/// What every thread of lanes gets a share of.
-struct Threads<'a> {
-    waits: &'a Waits,
-    stop: &'a Shutdown,
-    updates: &'a watch::Receiver<Option<Arc<PolicyUpdate>>>,
-    queue: QueueInput,
+/// What those who play hear from the rest of the actor, and where they put what they played.
+#[derive(Debug)]
+pub struct Playing {
+    /// The newest policy.
+    pub updates: watch::Receiver<Option<Arc<PolicyUpdate>>>,
+    /// For segments.
+    pub queue: QueueInput,
+    /// Evaluations to play, one at a time.
+    pub leases: mpsc::Receiver<Lease>,
+    /// For their results, under their leases' ids.
+    pub reports: mpsc::UnboundedSender<(u64, Vec<EpisodeResult>)>,
+    /// Where a wait is explained.
+    pub waits: Waits,
+    /// When to stop.
+    pub stop: Shutdown,
+    /// What is counted.
+    pub metrics: ActorMetrics,
 }
 
-impl Threads<'_> {
-    fn start(
-        self,
-        setup: &ActorSetup,
-        control_limit: f64,
-        desk: EvaluationDesk,
-        metrics: &ActorMetrics,
-    ) -> Result<JoinSet<Result<(), ActorError>>, SimError> {
+impl Playing {
+    /// Starts the threads of lanes.
+    fn start(self, setup: &ActorSetup) -> Result<JoinSet<Result<(), ActorError>>, ActorError> {
+        let control_limit = setup.beta.ceiling.max(1.0);
         let settings = LaneSettings {
             task: Arc::new(GetUp::new(&setup.task, control_limit)?),
             config: setup.config.clone(),
@@ -133,7 +158,14 @@ impl Threads<'_> {
             identity: setup.identity.clone(),
             beta: setup.beta,
             diverged_folder: setup.diverged_folder.clone(),
-            metrics: metrics.clone(),
+            metrics: self.metrics,
+        };
+        let desk = EvaluationDesk {
+            task: setup.task.clone(),
+            control_limit,
+            leases: self.leases,
+            reports: self.reports,
+            evaluator: None,
         };
         let mut desk = Some(desk);
         let mut threads = JoinSet::new();

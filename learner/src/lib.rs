@@ -11,8 +11,8 @@
 //! - `hub`: what actors see of the learner: the newest policy, leases, and who is there; `service` is its gRPC;
 //! - `checkpoint` and `run_folder`: what a run leaves on disk, and how it is resumed.
 //!
-//! Everything that needs libtorch is behind the feature `torch`; without it the settings and the pure state
-//! machines remain, for binaries that serve actors and the replay alone.
+//! Everything that needs libtorch is behind the feature `torch`; without it the settings, the state machines and
+//! what actors see of a learner remain, for binaries that serve actors and the replay alone, and for simulations.
 
 pub mod config;
 pub mod curriculum;
@@ -26,9 +26,7 @@ pub mod checkpoint;
 mod cpu;
 #[cfg(feature = "torch")]
 pub mod device;
-#[cfg(feature = "torch")]
 pub mod hub;
-#[cfg(feature = "torch")]
 pub mod hub_metrics;
 #[cfg(feature = "torch")]
 mod metrics;
@@ -39,7 +37,6 @@ mod parameters;
 pub mod run_folder;
 #[cfg(feature = "torch")]
 pub mod sac;
-#[cfg(feature = "torch")]
 pub mod service;
 #[cfg(feature = "torch")]
 mod statistics;

@@ -3,12 +3,12 @@
 use std::future::ready;
 use std::pin::Pin;
 use std::sync::Arc;
-use std::time::Instant;
 
 use futures::{Stream, StreamExt};
 use getup_proto::v1::learner_server::{Learner, LearnerServer};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, SpecError, v1};
 use getup_telemetry::Shutdown;
+use tokio::time::Instant;
 use tokio_stream::wrappers::WatchStream;
 use tonic::{Request, Response, Status};
 
@@ -70,7 +70,7 @@ impl Learner for Service {
         &self,
         request: Request<v1::HeartbeatRequest>,
     ) -> Result<Response<v1::HeartbeatReply>, Status> {
-        Ok(Response::new(self.hub.heartbeat(request.into_inner(), Instant::now())?))
+        Ok(Response::new(self.hub.heartbeat(request.into_inner(), now())?))
     }
 
     async fn report(
@@ -82,6 +82,11 @@ impl Learner for Service {
     }
 
     async fn status(&self, _: Request<v1::StatusRequest>) -> Result<Response<v1::StatusReply>, Status> {
-        Ok(Response::new(self.hub.status(Instant::now())))
+        Ok(Response::new(self.hub.status(now())))
     }
+}
+
+/// By the clock of the runtime, which a simulation moves.
+fn now() -> std::time::Instant {
+    Instant::now().into_std()
 }

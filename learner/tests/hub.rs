@@ -1,5 +1,4 @@
 //! The learner's interface to actors, driven the same way in process and over gRPC.
-#![cfg(feature = "torch")]
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};

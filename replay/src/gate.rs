@@ -130,15 +130,32 @@ impl Gate {
             if left.is_zero() || cancelled() {
                 return false;
             }
-            if matches!(blocked, Blocked::Consumed { .. }) {
-                inner.limiter.want(batch);
-                self.wake_writers();
-            }
-            self.explain(wait, "sampler", || inner.reason(&blocked, &inner.writers));
+            self.sampler_waits(&mut inner, &blocked, batch, wait);
             let tick = left.min(CANCEL_TICK);
             inner = self.moved.wait_timeout(inner, tick).unwrap_or_else(PoisonError::into_inner).0;
         }
         true
+    }
+
+    /// The same, in a task that whoever shuts down drops.
+    pub(crate) async fn wait_to_sample_task(&self, batch: u64, wait: &mut Waiting) {
+        let mut moved = self.moved_tasks.subscribe();
+        loop {
+            {
+                let mut inner = self.lock();
+                let Some(blocked) = inner.limiter.blocks_sample(batch) else { return };
+                self.sampler_waits(&mut inner, &blocked, batch, wait);
+            }
+            // The sender lives in `self`; a wait that times out only refreshes its reason.
+            let _ = tokio::time::timeout(REASON_TICK, moved.changed()).await;
+        }
+    }
+
+    fn sampler_waits(&self, inner: &mut Inner, blocked: &Blocked, batch: u64, wait: &mut Waiting) {
+        if matches!(blocked, Blocked::Consumed { .. }) && inner.limiter.want(batch) {
+            self.wake_tasks();
+        }
+        self.explain(wait, "sampler", || inner.reason(blocked, &inner.writers));
     }
 
     /// Room for an insert, if it need not wait.
@@ -243,11 +260,11 @@ impl Gate {
 
     fn wake(&self) {
         self.moved.notify_all();
-        self.wake_writers();
+        self.wake_tasks();
     }
 
     /// Those that are tasks; threads look for themselves, often enough.
-    fn wake_writers(&self) {
+    fn wake_tasks(&self) {
         self.moved_tasks.send_replace(());
     }
 

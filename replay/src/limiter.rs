@@ -143,9 +143,11 @@ impl Limiter {
         self.available = available;
     }
 
-    /// Notes that a sampler waits for so many transitions.
-    pub(crate) fn want(&mut self, transitions: u64) {
+    /// Notes that a sampler waits for so many transitions; whether that is more than was known.
+    pub(crate) fn want(&mut self, transitions: u64) -> bool {
+        let more = transitions > self.wanted;
         self.wanted = self.wanted.max(transitions);
+        more
     }
 
     /// Counts env steps that have become durable.

@@ -107,12 +107,19 @@ impl LocalSource {
         self.sampler = sampler;
     }
 
-    /// As [`MinibatchSource::poll`]; also None once `cancelled`.
-    pub(crate) fn poll_unless(
-        &mut self,
-        patience: Duration,
-        cancelled: impl Fn() -> bool,
-    ) -> Result<Option<Minibatch>, SampleError> {
+    /// Returns when there might be a minibatch, or at the shutdown.
+    pub(crate) async fn ready(&mut self) {
+        let gate = self.store.gate();
+        gate.heard_sampler(self.id);
+        tokio::select! {
+            () = gate.wait_to_sample_task(self.options.batch as u64, &mut self.wait) => {}
+            () = self.shutdown.wait() => {}
+        }
+    }
+}
+
+impl MinibatchSource for LocalSource {
+    fn poll(&mut self, patience: Duration) -> Result<Option<Minibatch>, SampleError> {
         let gate = self.store.gate();
         gate.heard_sampler(self.id);
         loop {
@@ -124,17 +131,11 @@ impl LocalSource {
                 return Ok(Some(minibatch));
             }
             // Another sampler may be quicker than this one after the wait.
-            let cancelled = || cancelled() || self.shutdown.is_triggered();
+            let cancelled = || self.shutdown.is_triggered();
             if !gate.wait_to_sample(self.options.batch as u64, patience, &mut self.wait, cancelled) {
                 return if self.shutdown.is_triggered() { Err(SampleError::Shutdown) } else { Ok(None) };
             }
         }
-    }
-}
-
-impl MinibatchSource for LocalSource {
-    fn poll(&mut self, patience: Duration) -> Result<Option<Minibatch>, SampleError> {
-        self.poll_unless(patience, || false)
     }
 
     fn update_priorities(&mut self, priorities: Vec<(u64, f32)>) -> Result<(), SampleError> {

@@ -19,6 +19,7 @@ use tonic::transport::Endpoint;
 use tonic::{Request, Status};
 use tower::ServiceExt;
 
+use crate::network::{DynStream, Network};
 use crate::reload::Reloaded;
 use crate::tls::Tls;
 use crate::token::Tokens;
@@ -94,6 +95,16 @@ impl Credentials {
     /// # Panics
     /// Outside a tokio runtime.
     pub fn channel(&self, address: &str, options: ChannelOptions) -> Result<Channel, AddressError> {
+        self.channel_through(&Network::default(), address, options)
+    }
+
+    /// As [`Credentials::channel`], through another network than TCP.
+    pub(crate) fn channel_through(
+        &self,
+        network: &Network,
+        address: &str,
+        options: ChannelOptions,
+    ) -> Result<Channel, AddressError> {
         let refused = |reason: &str| AddressError { address: address.to_owned(), reason: reason.to_owned() };
         let (scheme, authority) = address.split_once("://").unwrap_or(("http", address));
         match scheme {
@@ -117,7 +128,8 @@ impl Credentials {
         let mut http = HttpConnector::new();
         http.enforce_http(false);
         http.set_nodelay(options.tcp_nodelay);
-        let connector = Connector { http, tls: self.tls.clone(), host, patience: options.connect_timeout };
+        let (network, tls) = (network.clone(), self.tls.clone());
+        let connector = Connector { http, network, tls, host, patience: options.connect_timeout };
         let channel = endpoint(uri, &options)
             .connect_with_connector_lazy(tower::service_fn(move |uri| connector.clone().connect(uri)));
         Ok(InterceptedService::new(channel, Bearer { tokens: self.tokens.clone() }))
@@ -160,13 +172,16 @@ impl fmt::Debug for Bearer {
 #[derive(Clone)]
 struct Connector {
     http: HttpConnector,
+    network: Network,
     tls: Option<Arc<Reloaded<Tls>>>,
     /// Whom the peer's certificate has to name.
     host: ServerName<'static>,
     patience: Duration,
 }
 
-type Connection = TokioIo<Either<TcpStream, TlsStream<TcpStream>>>;
+/// Of TCP, but in a simulation.
+type Plain = Either<TcpStream, DynStream>;
+type Connection = TokioIo<Either<Plain, TlsStream<Plain>>>;
 
 impl Connector {
     async fn connect(self, uri: Uri) -> Result<Connection, Box<dyn Error + Send + Sync>> {
@@ -179,15 +194,14 @@ impl Connector {
     }
 
     async fn connect_to(self, uri: Uri, place: &str) -> Result<Connection, String> {
-        let tcp = self
-            .http
-            .oneshot(uri)
-            .await
-            .map_err(|error| format!("cannot connect to {place}: {}", root_cause(&error)))?
-            .into_inner();
-        let Some(tls) = self.tls else { return Ok(TokioIo::new(Either::Left(tcp))) };
+        let refused = |error: &dyn Error| format!("cannot connect to {place}: {}", root_cause(error));
+        let plain = match &self.network.connect {
+            None => Plain::Left(self.http.oneshot(uri).await.map_err(|error| refused(&error))?.into_inner()),
+            Some(connect) => Plain::Right(connect(uri).await.map_err(|error| refused(&error))?),
+        };
+        let Some(tls) = self.tls else { return Ok(TokioIo::new(Either::Left(plain))) };
         let connector = TlsConnector::from(Arc::clone(&tls.current().client));
-        let stream = connector.connect(self.host, tcp).await.map_err(|error| {
+        let stream = connector.connect(self.host, plain).await.map_err(|error| {
             format!("no TLS with {place}: {error}; are the certificates of both ends from one authority?")
         })?;
         Ok(TokioIo::new(Either::Right(stream)))

@@ -8,21 +8,21 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::{Context, Poll};
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::TcpStream;
 use tokio::time::{Instant, Sleep};
 use tokio_rustls::server::TlsStream;
 use tokio_util::either::Either;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
 use crate::metrics::{Metrics, Reason};
+use crate::network;
 use crate::seats::Seat;
 
 /// The bytes, with TLS or without.
-pub(crate) type Stream = Either<TcpStream, TlsStream<TcpStream>>;
+pub(crate) type Stream<S> = Either<S, TlsStream<S>>;
 
 /// The connection as tonic serves it.
-pub(crate) struct Connection {
-    stream: Stream,
+pub(crate) struct Connection<S> {
+    stream: Stream<S>,
     peer: Peer,
     /// Until when the peer must have made a call that was let in; then gone.
     deadline: Option<Pin<Box<Sleep>>>,
@@ -51,8 +51,14 @@ impl Peer {
     }
 }
 
-impl Connection {
-    pub(crate) fn new(stream: Stream, peer: Peer, deadline: Instant, metrics: Metrics, seat: Seat) -> Self {
+impl<S> Connection<S> {
+    pub(crate) fn new(
+        stream: Stream<S>,
+        peer: Peer,
+        deadline: Instant,
+        metrics: Metrics,
+        seat: Seat,
+    ) -> Self {
         let deadline = Some(Box::pin(tokio::time::sleep_until(deadline)));
         Self { stream, peer, deadline, metrics, _seat: seat }
     }
@@ -72,7 +78,7 @@ impl Connection {
     }
 }
 
-impl Connected for Connection {
+impl<S: network::Stream> Connected for Connection<S> {
     type ConnectInfo = Peer;
 
     fn connect_info(&self) -> Peer {
@@ -80,7 +86,7 @@ impl Connected for Connection {
     }
 }
 
-impl AsyncRead for Connection {
+impl<S: network::Stream> AsyncRead for Connection<S> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -91,7 +97,7 @@ impl AsyncRead for Connection {
     }
 }
 
-impl AsyncWrite for Connection {
+impl<S: network::Stream> AsyncWrite for Connection<S> {
     fn poll_write(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,

@@ -1,6 +1,6 @@
 //! Where a service is, and what it wants to be shown.
 
-use crate::{AddressError, Channel, ChannelOptions, Credentials};
+use crate::{AddressError, Channel, ChannelOptions, Credentials, Network};
 
 /// A service of another role.
 #[derive(Clone, Debug, Default)]
@@ -9,12 +9,14 @@ pub struct Endpoint {
     pub address: String,
     /// What this process shows there.
     pub credentials: Credentials,
+    /// How it is reached.
+    pub network: Network,
 }
 
 impl Endpoint {
-    /// The service at this address.
+    /// The service at this address, by TCP.
     pub fn new(address: &str, credentials: &Credentials) -> Self {
-        Self { address: address.to_owned(), credentials: credentials.clone() }
+        Self { address: address.to_owned(), credentials: credentials.clone(), network: Network::default() }
     }
 
     /// As [`Credentials::channel`].
@@ -25,7 +27,7 @@ impl Endpoint {
     /// # Panics
     /// Outside a tokio runtime.
     pub fn channel(&self, options: ChannelOptions) -> Result<Channel, AddressError> {
-        self.credentials.channel(&self.address, options)
+        self.credentials.channel_through(&self.network, &self.address, options)
     }
 }
 

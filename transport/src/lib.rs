@@ -11,6 +11,7 @@
 //! | [`credentials`] | [`Credentials`]: the files of the configuration, read |
 //! | [`channel`] | [`Channel`]: a client's lazy connection, with token and TLS; its [`ChannelOptions`] |
 //! | [`endpoint`] | [`Endpoint`]: an address with the credentials that are shown there |
+//! | [`network`] | [`Listener`] and [`Network`]: TCP, or what a simulation puts in its place |
 //! | [`server`] | [`Server`]: a port with TLS, token and [`Limits`] in front of its services |
 //! | [`metrics`] | [`Metrics`]: connections, and those that were refused |
 //! | [`token`] | [`generate_token`], and [`authorized`] for ports that are not gRPC |
@@ -25,6 +26,7 @@ mod door;
 pub mod endpoint;
 mod error;
 pub mod metrics;
+pub mod network;
 mod reload;
 mod seats;
 pub mod server;
@@ -39,5 +41,6 @@ pub use credentials::Credentials;
 pub use endpoint::Endpoint;
 pub use error::{AddressError, SecurityError};
 pub use metrics::Metrics;
+pub use network::{Listener, Network};
 pub use server::{Limits, Server};
 pub use token::{authorized, generate_token};

@@ -7,7 +7,6 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use getup_telemetry::Backoff;
-use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, timeout_at};
 use tokio_rustls::TlsAcceptor;
@@ -19,6 +18,7 @@ use tonic::service::{InterceptorLayer, Routes};
 use crate::connection::{Connection, Peer, Stream};
 use crate::door::Door;
 use crate::metrics::Reason;
+use crate::network::{self, Listener};
 use crate::seats::{Seat, Seats};
 use crate::{Credentials, Metrics, Window};
 
@@ -75,7 +75,7 @@ impl Server {
     /// When tonic fails; a connection that fails ends alone.
     pub async fn serve(
         self,
-        listener: TcpListener,
+        listener: impl Listener,
         routes: Routes,
         shutdown: impl Future<Output = ()>,
     ) -> Result<(), tonic::transport::Error> {
@@ -102,7 +102,7 @@ impl Server {
     }
 
     /// Takes connections while there are places for them; each shakes hands by itself, so that none waits for another.
-    async fn accept(self, listener: TcpListener, accepted: &mpsc::Sender<Connection>) {
+    async fn accept<L: Listener>(self, listener: L, accepted: &mpsc::Sender<Connection<L::Stream>>) {
         let Limits { connections, connections_per_peer, .. } = self.limits;
         let seats = Seats::new(connections, connections_per_peer, self.metrics.connections.clone());
         let server = Arc::new(self);
@@ -141,9 +141,14 @@ impl Server {
     }
 
     /// The connection, once hands are shaken.
-    async fn welcome(&self, stream: TcpStream, remote: SocketAddr, seat: Seat) -> Option<Connection> {
+    async fn welcome<S: network::Stream>(
+        &self,
+        stream: S,
+        remote: SocketAddr,
+        seat: Seat,
+    ) -> Option<Connection<S>> {
         let deadline = Instant::now() + self.limits.handshake_timeout;
-        let peer = Peer::new(stream.local_addr().ok(), remote);
+        let peer = Peer::new(stream.local_addr(), remote);
         let shaken = timeout_at(deadline, self.shake_hands(stream)).await;
         let stream = match shaken.unwrap_or_else(|late| Err(late.into())) {
             Ok(stream) => stream,
@@ -155,10 +160,8 @@ impl Server {
         Some(Connection::new(stream, peer, deadline, self.metrics.clone(), seat))
     }
 
-    async fn shake_hands(&self, stream: TcpStream) -> io::Result<Stream> {
-        stream.set_nodelay(true)?;
-        #[cfg(target_os = "linux")]
-        socket2::SockRef::from(&stream).set_tcp_user_timeout(Some(self.limits.send_timeout))?;
+    async fn shake_hands<S: network::Stream>(&self, stream: S) -> io::Result<Stream<S>> {
+        stream.prepare(self.limits.send_timeout)?;
         let Some(tls) = &self.credentials.tls else { return Ok(Either::Left(stream)) };
         let acceptor = TlsAcceptor::from(Arc::clone(&tls.current().server));
         let accepted = acceptor.accept(stream).await;

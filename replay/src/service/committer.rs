@@ -1,12 +1,14 @@
-//! The one thread that appends: it takes what the streams have queued and commits it together.
+//! The one task that appends: it takes what the streams have queued and commits it together.
 //!
 //! While the disk takes one group, the next gathers in the queue: the busier the service, the larger its commits.
 
+use super::blocking::blocking;
 use crate::error::StoreError;
 use crate::gate::Permit;
 use crate::store::Store;
 use getup_proto::{RunSpec, Segment};
 use getup_telemetry::Shutdown;
+use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot, watch};
 
 /// Segments of a commit, and of the queue, at most.
@@ -29,20 +31,20 @@ pub(super) fn queue_length(spec: &RunSpec) -> usize {
 }
 
 /// Works until all senders of the queue are gone, an append fails, or `shutdown` finds the disk full.
-pub(super) fn run(
-    store: &Store,
+pub(super) async fn run(
+    store: Arc<Store>,
     mut queue: mpsc::Receiver<Job>,
-    shutdown: &Shutdown,
+    shutdown: Shutdown,
 ) -> Result<(), StoreError> {
     let most = queue_length(store.spec());
     let mut jobs = Vec::with_capacity(most);
-    while queue.blocking_recv_many(&mut jobs, most) > 0 {
+    while queue.recv_many(&mut jobs, most).await > 0 {
         let mut segments = Vec::with_capacity(jobs.len());
         let mut acknowledgements = Vec::with_capacity(jobs.len());
         for job in jobs.drain(..) {
             match job {
                 Job::Introduce { writer, name, durable } => {
-                    if durable.send(store.introduce(writer, &name)).is_err() {
+                    if durable.send(blocking(|| store.introduce(writer, &name)).await).is_err() {
                         store.farewell(writer);
                     }
                 }
@@ -52,7 +54,7 @@ pub(super) fn run(
                 }
             }
         }
-        if !store.append_when_there_is_room(&segments, shutdown)? {
+        if !blocking(|| store.append_when_there_is_room(&segments, &shutdown)).await? {
             tracing::warn!("replay ends with {} segments that a full disk did not take", segments.len());
             return Ok(());
         }

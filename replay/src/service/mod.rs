@@ -2,9 +2,10 @@
 //!
 //! - [`append`]: a writer's stream
 //! - [`sample`]: a sampler's stream
-//! - [`committer`]: the one thread that appends to a table, for all streams together
+//! - [`committer`]: the one task that appends to a table, for all streams together
 
 mod append;
+mod blocking;
 mod committer;
 mod sample;
 
@@ -14,16 +15,16 @@ use crate::metrics::ReplayMetrics;
 use crate::store::Store;
 use crate::tables::Tables;
 use append::AppendStream;
+use blocking::blocking;
 use committer::Job;
 use getup_proto::v1::replay_server::{Replay, ReplayServer};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, SpecError, v1};
 use getup_telemetry::health::{ServingStatus, health};
 use getup_telemetry::{Registry, Shutdown};
-use getup_transport::{Credentials, Limits, Metrics, Server, Window};
+use getup_transport::{Credentials, Limits, Listener, Metrics, Server, Window};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio_stream::wrappers::ReceiverStream;
@@ -52,7 +53,7 @@ pub enum ServeError {
     /// The network refuses.
     #[error("the replay service cannot go on: {0}")]
     Transport(#[from] tonic::transport::Error),
-    /// A thread of the service panicked.
+    /// A task of the service panicked.
     #[error("the replay service broke: {0}")]
     Panicked(#[from] tokio::task::JoinError),
 }
@@ -62,7 +63,7 @@ pub enum ServeError {
 /// # Errors
 /// As [`serve_at`].
 pub async fn serve(
-    listener: TcpListener,
+    listener: impl Listener,
     tables: impl Into<Tables>,
     shutdown: Shutdown,
 ) -> Result<(), ServeError> {
@@ -83,15 +84,14 @@ pub fn limits() -> Limits {
 /// [`ServeError`], when a store or the network fails.
 pub async fn serve_at(
     port: Server,
-    listener: TcpListener,
+    listener: impl Listener,
     tables: impl Into<Tables>,
     shutdown: Shutdown,
 ) -> Result<(), ServeError> {
     let mut committing = JoinSet::new();
     let mut begin = |(name, store): (String, Arc<Store>)| {
         let (jobs, queue) = mpsc::channel(committer::queue_length(store.spec()));
-        let (committed, shutdown) = (store.clone(), shutdown.clone());
-        committing.spawn_blocking(move || committer::run(&committed, queue, &shutdown));
+        committing.spawn(committer::run(store.clone(), queue, shutdown.clone()));
         (name, Table { store, jobs })
     };
     let tables: BTreeMap<String, Table> = tables.into().into_stores().into_iter().map(&mut begin).collect();
@@ -136,7 +136,7 @@ struct Service {
     shutdown: Shutdown,
 }
 
-/// A store, and the way to the thread that appends to it.
+/// A store, and the way to the task that appends to it.
 struct Table {
     store: Arc<Store>,
     jobs: mpsc::Sender<Job>,
@@ -213,8 +213,7 @@ impl Replay for Service {
         request: Request<v1::DescribeRequest>,
     ) -> Result<Response<v1::DescribeReply>, Status> {
         let store = self.store(&request.into_inner().table)?;
-        let described = tokio::task::spawn_blocking(move || store.describe()).await;
-        let described = described.map_err(|error| Status::internal(error.to_string()))?;
+        let described = blocking(|| store.describe()).await;
         let tables = self.tables.keys().cloned().collect();
         Ok(Response::new(v1::DescribeReply { tables, ..described }))
     }
@@ -237,10 +236,8 @@ impl Replay for Service {
             )));
         }
         let store = self.store(&table)?;
-        let updating = tokio::task::spawn_blocking(move || {
-            store.update_priorities(&keys.into_iter().zip(priorities).collect::<Vec<_>>())
-        });
-        match updating.await.map_err(|error| Status::internal(error.to_string()))? {
+        let priorities: Vec<(u64, f32)> = keys.into_iter().zip(priorities).collect();
+        match blocking(|| store.update_priorities(&priorities)).await {
             Ok(updated) => Ok(Response::new(v1::UpdatePrioritiesReply { updated })),
             Err(error) => Err(Status::invalid_argument(error.to_string())),
         }
@@ -258,7 +255,7 @@ impl Replay for Service {
             )));
         }
         let store = self.store(&table)?;
-        let taken = tokio::task::spawn_blocking(move || {
+        let taken = blocking(|| {
             let started = Instant::now();
             let path = store.dir().join(SNAPSHOTS).join(&name);
             let (paused, counters) = store.snapshot(&path)?;
@@ -269,7 +266,7 @@ impl Replay for Service {
                 counters: Some(counters.into()),
             })
         });
-        match taken.await.map_err(|error| Status::internal(error.to_string()))? {
+        match taken.await {
             Ok(reply) => Ok(Response::new(reply)),
             Err(error) => Err(Status::failed_precondition(error.to_string())),
         }

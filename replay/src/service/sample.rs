@@ -1,5 +1,6 @@
 //! A sampler's stream: credits in, minibatches out.
 
+use super::blocking::blocking;
 use super::{named, shutting_down};
 use crate::minibatch::SampleOptions;
 use crate::source::{LocalSource, MinibatchSource, SampleError};
@@ -37,7 +38,7 @@ pub(super) fn source(
     LocalSource::new(store.clone(), options, &name, shutdown).map_err(status)
 }
 
-/// Serves the stream: a task reads its credits, and a thread gathers its minibatches.
+/// Serves the stream: a task reads its credits, and another gathers its minibatches.
 pub(super) fn start(
     source: LocalSource,
     mut inbound: Streaming<v1::SampleRequest>,
@@ -69,52 +70,60 @@ pub(super) fn start(
             let _ = refusals.send(Err(status)).await;
         }
     });
-    tokio::task::spawn_blocking(move || {
-        if let Err(error) = gather(source, credits, &replies) {
+    tokio::spawn(async move {
+        if let Err(error) = gather(source, credits, &replies).await {
             // As above.
-            let _ = replies.blocking_send(Err(status(error)));
+            let _ = replies.send(Err(status(error))).await;
         }
     });
 }
 
 /// Sends minibatches as far as the credits go, until the client has gone.
-fn gather(
+async fn gather(
     mut source: LocalSource,
     mut credits: mpsc::Receiver<u32>,
     replies: &Replies,
 ) -> Result<(), SampleError> {
     let mut owed: u64 = 0;
-    while !replies.is_closed() {
+    loop {
         while let Ok(more) = credits.try_recv() {
             owed += u64::from(more);
         }
         if owed == 0 {
-            match credits.blocking_recv() {
+            match credits.recv().await {
                 Some(more) => owed += u64::from(more),
                 None => return Ok(()),
             }
             continue;
         }
-        let Some(minibatch) = source.poll_unless(Duration::MAX, || replies.is_closed())? else {
-            return Ok(());
-        };
-        let bytes: usize =
-            minibatch.columns.iter().map(|column| column.data.len() * columns::VALUE_BYTES).sum();
+        tokio::select! {
+            () = source.ready() => {}
+            () = replies.closed() => return Ok(()),
+        }
         // A part of what is owed: while the client takes that in, the next is gathered.
         let share = owed.div_ceil(MESSAGES_AHEAD) as usize;
-        let most = (MESSAGE_BYTES / bytes.max(1)).clamp(1, share);
-        let mut minibatches = vec![minibatch.into_wire()];
-        while minibatches.len() < most
-            && let Some(minibatch) = source.poll(Duration::ZERO)?
-        {
-            minibatches.push(minibatch.into_wire());
-        }
+        let minibatches = blocking(|| message(&mut source, share)).await?;
         owed -= minibatches.len() as u64;
-        if replies.blocking_send(Ok(v1::SampleReply { minibatches })).is_err() {
+        // None where another sampler was quicker.
+        if !minibatches.is_empty() && replies.send(Ok(v1::SampleReply { minibatches })).await.is_err() {
             return Ok(());
         }
     }
-    Ok(())
+}
+
+/// Up to `share` minibatches that need not wait, and no more than a message holds.
+fn message(source: &mut LocalSource, share: usize) -> Result<Vec<v1::Minibatch>, SampleError> {
+    let mut minibatches = Vec::new();
+    let mut most = share;
+    while minibatches.len() < most
+        && let Some(minibatch) = source.poll(Duration::ZERO)?
+    {
+        let bytes: usize =
+            minibatch.columns.iter().map(|column| column.data.len() * columns::VALUE_BYTES).sum();
+        most = (MESSAGE_BYTES / bytes.max(1)).clamp(1, share);
+        minibatches.push(minibatch.into_wire());
+    }
+    Ok(minibatches)
 }
 
 fn status(error: SampleError) -> Status {

@@ -1,0 +1,173 @@
+//! The protocol in a simulation: all roles on machines of their own, on one thread, with one clock and one seed.
+//!
+//! Real are the actor's role (queue, spread, links, heartbeats, reports, shutdown), the replay's service over its store on
+//! disk, the learner's hub, leases, service and curriculum, and the transport with HTTP/2 and gRPC. Stubs are what plays
+//! and what learns. turmoil brings the clock and the network, in which messages are late, held back and lost; a
+//! machine loses its power at any write to the network, and keeps its disk as it was then.
+//!
+//! | module | what lives there |
+//! | --- | --- |
+//! | `schedule` | what happens to machines and links, out of a seed |
+//! | `ledger` | what has happened, and the promises it is held against |
+//! | `roles`, `trainer` | the three roles; the stubs |
+//! | `machine`, `network` | the power, the disk, the wires |
+//!
+//! Each schedule has a process of its own, whose random numbers all come from its seed: they do too where they ask the
+//! operating system. `GETUP_SIMULATION_SEED=N cargo test --release -p getup-actor --test simulation -- --nocapture` plays
+//! that of seed N aloud. `GETUP_TEST_FULL` plays thousands.
+
+mod ledger;
+mod machine;
+mod network;
+mod roles;
+mod schedule;
+mod trainer;
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use tempfile::TempDir;
+
+/// The seed that somebody wants repeated.
+const SEED: &str = "GETUP_SIMULATION_SEED";
+/// The seed of a process' own schedule.
+const SCHEDULE: &str = "GETUP_TEST_SCHEDULE";
+/// An empty folder for its disks.
+const FOLDER: &str = "GETUP_TEST_FOLDER";
+/// Whether it tells every event.
+const ALOUD: &str = "GETUP_TEST_ALOUD";
+/// Real time after which a schedule is taken to hang.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// Seeds of schedules that found something once.
+const REGRESSIONS: [u64; 0] = [];
+
+/// Random numbers of the operating system, out of the seed: every thread has the same.
+const RANDOMNESS: &str = r#"
+#include <stdint.h>
+#include <stdlib.h>
+#include <sys/types.h>
+
+ssize_t getrandom(void *bytes, size_t count, unsigned int flags) {
+    static __thread uint64_t state;
+    (void)flags;
+    if (!state) state = strtoull(getenv("GETUP_TEST_SCHEDULE"), 0, 10) * 2 + 1;
+    for (size_t at = 0; at < count; at++) {
+        state = state * 6364136223846793005u + 1442695040888963407u;
+        ((unsigned char *)bytes)[at] = (unsigned char)(state >> 56);
+    }
+    return (ssize_t)count;
+}
+"#;
+
+/// The process of a schedule: without its variable there is nothing to prove here.
+#[test]
+fn plays_its_schedule() {
+    let Ok(seed) = std::env::var(SCHEDULE) else { return };
+    std::thread::spawn(|| {
+        std::thread::sleep(PATIENCE);
+        eprintln!("the schedule hangs: it was not played within {PATIENCE:?}");
+        std::process::abort();
+    });
+    let folder = PathBuf::from(std::env::var_os(FOLDER).unwrap());
+    match schedule::play(seed.parse().unwrap(), &folder, std::env::var_os(ALOUD).is_some()) {
+        Ok(summary) => println!("\nplayed: {summary}"),
+        Err(broken) => panic!("\nbroken: {broken}"),
+    }
+}
+
+/// Starts processes of schedules.
+struct Player {
+    randomness: PathBuf,
+    _folder: TempDir,
+}
+
+impl Player {
+    fn new() -> Self {
+        let folder = TempDir::new().unwrap();
+        let (source, randomness) = (folder.path().join("random.c"), folder.path().join("random.so"));
+        std::fs::write(&source, RANDOMNESS).unwrap();
+        let compiled =
+            Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&randomness).arg(&source).status();
+        assert!(compiled.unwrap().success());
+        Self { randomness, _folder: folder }
+    }
+
+    fn command(&self, seed: u64, folder: &TempDir) -> Command {
+        let mut command = Command::new(std::env::current_exe().unwrap());
+        command
+            .args(["--exact", "plays_its_schedule", "--nocapture"])
+            .env(SCHEDULE, seed.to_string())
+            .env(FOLDER, folder.path())
+            .env("LD_PRELOAD", &self.randomness);
+        command
+    }
+
+    fn play(&self, seed: u64) -> Result<String, String> {
+        let folder = TempDir::new().unwrap();
+        let Output { status, stdout, stderr } = self.command(seed, &folder).output().unwrap();
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        let (stdout, stderr) = (text(&stdout), text(&stderr));
+        match stdout.lines().find(|line| line.starts_with("played: ")) {
+            Some(summary) if status.success() => Ok(summary.to_owned()),
+            _ => Err(stderr),
+        }
+    }
+}
+
+fn repeat_with(seed: u64) -> String {
+    let this = Path::new("actor").join("tests").join("simulation");
+    format!(
+        "{SEED}={seed} cargo test --release -p getup-actor --test simulation -- --nocapture (see {})",
+        this.display()
+    )
+}
+
+#[test]
+fn what_is_promised_is_kept_in_every_schedule() {
+    let player = Player::new();
+    if let Ok(seed) = std::env::var(SEED) {
+        let folder = TempDir::new().unwrap();
+        let status = player.command(seed.parse().unwrap(), &folder).env(ALOUD, "1").status().unwrap();
+        assert!(status.success(), "the schedule of seed {seed} breaks a promise");
+        return;
+    }
+    let seeds: u64 = if std::env::var_os("GETUP_TEST_FULL").is_some() { 3_000 } else { 100 };
+    let (next, broken) = (AtomicU64::new(0), Mutex::new(Vec::new()));
+    std::thread::scope(|scope| {
+        for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
+            scope.spawn(|| {
+                while broken.lock().unwrap().is_empty() {
+                    let index = next.fetch_add(1, Ordering::Relaxed);
+                    let seed = match REGRESSIONS.get(index as usize) {
+                        Some(seed) => *seed,
+                        None if index < seeds + REGRESSIONS.len() as u64 => index - REGRESSIONS.len() as u64,
+                        None => return,
+                    };
+                    if let Err(output) = player.play(seed) {
+                        broken.lock().unwrap().push((seed, output));
+                    }
+                }
+            });
+        }
+    });
+    if let Some((seed, output)) = broken.into_inner().unwrap().first() {
+        panic!(
+            "the schedule of seed {seed} breaks a promise:\n{output}\nrepeat it with\n{}",
+            repeat_with(*seed)
+        );
+    }
+}
+
+#[test]
+fn a_seed_repeats_its_schedule_event_by_event() {
+    let player = Player::new();
+    for seed in 0..4 {
+        let first = player.play(seed).unwrap();
+        assert_eq!(player.play(seed).unwrap(), first, "seed {seed}");
+    }
+    assert_ne!(player.play(0), player.play(1), "and another seed has another");
+}
