@@ -33,8 +33,8 @@ struct Pages {
     counted_leases: BTreeSet<u64>,
     /// The newest broadcast, its stage and its β.
     broadcast: Option<(PolicyVersion, u32, f64)>,
-    /// By actor: the newest policy it acts by, and what this start of it had acknowledged.
-    actors: BTreeMap<String, (PolicyVersion, u64)>,
+    /// By actor: the newest policy that this start of it acts by, and what each replay has acknowledged.
+    actors: BTreeMap<String, (PolicyVersion, Vec<u64>)>,
     /// Actors that have ended in order, and what they left unacknowledged.
     ended: BTreeMap<String, usize>,
     /// Env steps of the run, as its learner counts them.
@@ -53,7 +53,7 @@ pub(crate) struct Progress {
     evaluations: usize,
     env_steps: u64,
     broadcast: PolicyVersion,
-    acknowledged: BTreeMap<String, u64>,
+    acknowledged: BTreeMap<String, Vec<u64>>,
     versions: BTreeMap<String, PolicyVersion>,
 }
 
@@ -68,8 +68,10 @@ impl Progress {
             stuck += "the learner counted no env steps; ";
         }
         for (actor, acknowledged) in &self.acknowledged {
-            if *acknowledged < before.acknowledged.get(actor).copied().unwrap_or(0) + 3 {
-                let _ = write!(stuck, "{actor} had nothing acknowledged; ");
+            for (replay, now) in acknowledged.iter().enumerate() {
+                if *now < before.acknowledged.get(actor).map_or(0, |before| before[replay]) + 3 {
+                    let _ = write!(stuck, "replay-{replay} has nothing new of {actor}; ");
+                }
             }
         }
         for (actor, version) in &self.versions {
@@ -131,10 +133,10 @@ impl Ledger {
     }
 
     /// An actor starts.
-    pub(crate) fn started(&self, machine: &Machine) {
+    pub(crate) fn started(&self, machine: &Machine, replays: usize) {
         {
             let mut pages = self.pages();
-            pages.actors.insert(machine.name.clone(), (PolicyVersion::default(), 0));
+            pages.actors.insert(machine.name.clone(), (PolicyVersion::default(), vec![0; replays]));
             pages.ended.remove(&machine.name);
         }
         self.event(machine, "starts");
@@ -163,7 +165,7 @@ impl Ledger {
             let more = sequence - written.acknowledged;
             written.acknowledged = sequence;
             if let Some(actor) = pages.actors.get_mut(&machine.name) {
-                actor.1 += more;
+                actor.1[replay] += more;
             }
         }
         self.event(machine, &format!("replay-{replay} has {writer:016x} up to {sequence}"));
@@ -284,7 +286,7 @@ impl Ledger {
             evaluations: pages.counted.len(),
             env_steps: pages.env_steps,
             broadcast: pages.broadcast.map_or_else(PolicyVersion::default, |broadcast| broadcast.0),
-            acknowledged: pages.actors.iter().map(|(name, actor)| (name.clone(), actor.1)).collect(),
+            acknowledged: pages.actors.iter().map(|(name, actor)| (name.clone(), actor.1.clone())).collect(),
             versions: pages.actors.iter().map(|(name, actor)| (name.clone(), actor.0)).collect(),
         }
     }

@@ -128,7 +128,7 @@ pub(crate) async fn actor(run: Arc<Run>, machine: Arc<Machine>) -> turmoil::Resu
         beta: BetaDraw { std: 0.04, floor: 0.4, ceiling: 1.0 },
         diverged_folder: Default::default(),
     };
-    run.ledger.started(&machine);
+    run.ledger.started(&machine, run.replays);
     let writer = |index: usize| {
         let (to, identity) = (endpoint(&replay_name(index), &machine), setup.identity.towards(index));
         let link = GrpcReplay::new(to, setup.spec.clone(), identity, waits.clone())?;
