@@ -14,7 +14,7 @@
 //!
 //! Each schedule has a process of its own, whose random numbers all come from its seed: they do too where they ask the
 //! operating system. `GETUP_SIMULATION_SEED=N cargo test --release -p getup-actor --test simulation -- --nocapture` plays
-//! that of seed N aloud. `GETUP_TEST_FULL` plays thousands.
+//! that of seed N aloud. `GETUP_TEST_FULL` plays five thousand.
 
 mod ledger;
 mod machine;
@@ -135,7 +135,7 @@ fn what_is_promised_is_kept_in_every_schedule() {
         assert!(status.success(), "the schedule of seed {seed} breaks a promise");
         return;
     }
-    let seeds: u64 = if std::env::var_os("GETUP_TEST_FULL").is_some() { 3_000 } else { 100 };
+    let seeds: u64 = if std::env::var_os("GETUP_TEST_FULL").is_some() { 5_000 } else { 300 };
     let (next, broken) = (AtomicU64::new(0), Mutex::new(Vec::new()));
     std::thread::scope(|scope| {
         for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
