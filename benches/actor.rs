@@ -24,7 +24,7 @@ use getup_proto::{ColumnSpec, PolicyVersion, Rows, RunSpec, Segment, columns};
 use getup_replay::{ReplayConfig, ReplayMetrics, Store};
 use getup_sim::falls::{self, Landed};
 use getup_sim::{GetUp, Task, TaskConfig};
-use getup_telemetry::{Registry, Waits};
+use getup_telemetry::{Registry, Traces, Waits};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tempfile::TempDir;
@@ -157,6 +157,7 @@ impl Actor {
             beta: BetaDraw { std: 0.04, floor: 0.4, ceiling: 1.0 },
             diverged_folder: folder.path().join("diverged"),
             metrics: metrics.clone(),
+            traces: Traces::default(),
         };
         let lanes = LaneGroup::new(settings, 0, case.config.lanes, policy_update(&case.policy))?;
         Ok(Self { lanes, metrics, store, sequence: 0, _folder: folder })

@@ -44,7 +44,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
 
 async fn serve(config: &Config, role: &Role, diverged: PathBuf) -> Result<()> {
     let identity = Identity::new(&config.actor.name, config.seed);
-    let setup = setup(config, identity.clone(), diverged)?;
+    let setup = setup(config, role, identity.clone(), diverged)?;
     let network = &config.network;
     let waits = &role.waits;
     let at = |address: &str| Endpoint::new(address, &role.credentials);
@@ -68,7 +68,12 @@ async fn serve(config: &Config, role: &Role, diverged: PathBuf) -> Result<()> {
 }
 
 /// Everything that an actor of this run is made from.
-pub(crate) fn setup(config: &Config, identity: Identity, diverged_folder: PathBuf) -> Result<ActorSetup> {
+pub(crate) fn setup(
+    config: &Config,
+    role: &Role,
+    identity: Identity,
+    diverged_folder: PathBuf,
+) -> Result<ActorSetup> {
     Ok(ActorSetup {
         config: config.actor.clone(),
         task: config.task.clone(),
@@ -76,5 +81,6 @@ pub(crate) fn setup(config: &Config, identity: Identity, diverged_folder: PathBu
         identity,
         beta: config.beta_draw(),
         diverged_folder,
+        traces: role.traces.clone(),
     })
 }

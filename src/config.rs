@@ -12,6 +12,7 @@ use getup_learner::config::{CurriculumConfig, EvaluationConfig, LearnerConfig, S
 use getup_proto::{ColumnSpec, Rows, RunSpec, columns};
 use getup_replay::{ItemSelector, Remover, ReplayConfig, SyncMode};
 use getup_sim::{GetUp, Task, TaskConfig};
+use getup_telemetry::TracesConfig;
 use getup_transport::SecurityConfig;
 use serde::{Deserialize, Serialize};
 
@@ -43,6 +44,7 @@ pub(crate) struct Config {
     pub(crate) learner: LearnerConfig,
     pub(crate) network: NetworkConfig,
     pub(crate) security: SecurityConfig,
+    pub(crate) traces: TracesConfig,
 }
 
 /// The replay's own settings; when it may be sampled follows from `[sac]`.
@@ -154,6 +156,7 @@ impl Default for Config {
             learner: LearnerConfig::default(),
             network: NetworkConfig::default(),
             security: SecurityConfig::default(),
+            traces: TracesConfig::default(),
         }
     }
 }
@@ -168,7 +171,8 @@ pub(crate) struct ConfigArgs {
     /// A configuration file over the preset, such as a run's own config.toml.
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<std::path::PathBuf>,
-    /// One setting over everything else, such as `--set sac.batch=256`; may be repeated.
+    /// One setting over everything else, such as `--set sac.batch=256`, or `--set traces.endpoint=http://HOST:4317` for
+    /// traces; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
 }
@@ -223,6 +227,7 @@ impl Config {
         );
         self.network.validate()?;
         self.security.validate()?;
+        self.traces.validate()?;
         self.replay_config(self.network.replays().len()).validate_for(&self.run_spec()?)?;
         self.sac.validate()?;
         self.curriculum.validate()?;

@@ -170,7 +170,8 @@ pub(crate) fn make_trainer(
         evaluation: config.evaluation.clone(),
         learner: config.learner.clone(),
     };
-    Ok(Trainer::new(trainer, folder, hub, incarnation, start, device, &role.registry)?)
+    let trainer = Trainer::new(trainer, folder, hub, incarnation, start, device, &role.registry)?;
+    Ok(trainer.followed_by(role.traces.clone()))
 }
 
 /// How the learner samples; each of its starts draws other minibatches.

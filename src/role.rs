@@ -1,4 +1,4 @@
-//! What every role's process has beside its work: logs, metrics, health, a runtime, and an orderly end.
+//! What every role's process has beside its work: logs, metrics, traces, health, a runtime, and an orderly end.
 
 use std::future::Future;
 use std::io::{self, Write};
@@ -7,8 +7,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
+use getup_telemetry::traces::Recorder;
 use getup_telemetry::{
-    LogFormat, Ready, Registry, Shown, Shutdown, Waits, build_info, init_logging, registry, serve_http,
+    LogFormat, Ready, Registry, Shown, Shutdown, Traces, Waits, build_info, init_logging, registry,
+    serve_http,
 };
 use getup_transport::{Credentials, Limits, Metrics, SecurityConfig, Server, require_protection};
 use indicatif::MultiProgress;
@@ -35,6 +37,8 @@ pub(crate) struct RoleArgs {
 pub(crate) struct Role {
     pub(crate) registry: Registry,
     pub(crate) waits: Waits,
+    /// What follows some segments from actor to minibatch.
+    pub(crate) traces: Traces,
     pub(crate) shutdown: Shutdown,
     /// What this process shows to others, and wants to be shown.
     pub(crate) credentials: Credentials,
@@ -57,8 +61,11 @@ impl Role {
         init_logging(log_format, move || LogWriter(writer.clone()))?;
         let registry = registry(&config.run);
         build_info(&registry, name);
+        let host = host_name();
+        let recorder = Recorder { role: name, run: &config.run, seed: config.seed, host: &host };
         Ok(Self {
             waits: Waits::new(&registry),
+            traces: Traces::start(&config.traces, recorder, &registry)?,
             credentials: Credentials::load(&config.security)?,
             security: config.security.clone(),
             connections: (config.network.connections, config.network.connections_per_address),
@@ -82,6 +89,7 @@ impl Role {
             self.shutdown.on_signals().context("cannot watch for signals")?;
             work.await
         });
+        self.traces.shutdown();
         // A thread that the disk or a peer holds up must not hold up the end.
         runtime.shutdown_timeout(GRACE);
         result

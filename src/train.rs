@@ -177,7 +177,7 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_
 
     let identity = Identity::new(&config.actor.name, config.seed);
     let writer = StoreWriter::new(store, &identity, role.shutdown.clone());
-    let setup = crate::actor::setup(config, identity, folder.root().join("diverged"))?;
+    let setup = crate::actor::setup(config, role, identity, folder.root().join("diverged"))?;
     let link = HubLink { hub: Arc::clone(&hub), spec, name: config.actor.name.clone() };
     let mut acting = {
         let role = role.clone();
@@ -208,7 +208,7 @@ fn open_store(config: &Config, role: &Role, folder: &RunFolder) -> Result<Arc<St
     let spec = config.run_spec()?;
     let metrics = ReplayMetrics::new(&role.registry);
     let store = Store::open(&folder.replay(), &spec, &config.replay_config(1), metrics, role.waits.clone())?;
-    Ok(Arc::new(store))
+    Ok(Arc::new(store.followed_by(role.traces.clone())))
 }
 
 /// Serves `/metrics`; where its port is taken, by another run on this machine, at any other.

@@ -11,6 +11,7 @@ use std::time::Instant;
 use getup_policy::{Forward, PolicyShape};
 use getup_proto::{PolicyVersion, RunSpec, Segment};
 use getup_sim::{Diverged, Lane, Phase, Step, Task};
+use getup_telemetry::Traces;
 use rand::{Rng, RngCore};
 use rand_chacha::ChaCha8Rng;
 use thiserror::Error;
@@ -55,6 +56,8 @@ pub struct LaneSettings {
     pub diverged_folder: PathBuf,
     /// What is counted.
     pub metrics: ActorMetrics,
+    /// What follows some of the segments.
+    pub traces: Traces,
 }
 
 /// Lanes that are stepped together.
@@ -213,7 +216,8 @@ impl Player {
                 config.segment_steps,
                 identity.writer,
                 index,
-            )?,
+            )?
+            .followed_by(settings.traces.clone()),
             store_limp: config.store_limp,
             observation: vec![0.0; observation],
             next_observation: vec![0.0; observation],

@@ -11,6 +11,7 @@
 //! | [`link`] | [`SegmentWriter`] and [`LearnerLink`], and the typed values that pass through them |
 //! | [`grpc`] | both as gRPC clients |
 //! | `queue`, `spread` | the bounded queue of segments, and its way to one or several replays |
+//! | [`sending`] | [`Sending`]: what traces tell of that way |
 //! | [`worker`] | [`run`]: the role, with its threads, its queue, heartbeats and shutdown; [`run_with`]: with a stub that plays |
 //! | [`config`], [`identity`], [`metrics`] | settings; who an actor is, and its random draws; what it counts |
 
@@ -29,6 +30,7 @@ mod office;
 mod pool;
 mod queue;
 pub mod segments;
+pub mod sending;
 mod spread;
 pub mod worker;
 
@@ -46,4 +48,5 @@ pub use link::{
 pub use metrics::ActorMetrics;
 pub use queue::QueueInput;
 pub use segments::{LayoutError, SegmentBuilder, StepEnd, StepRecord};
+pub use sending::Sending;
 pub use worker::{ActorSetup, Playing, run, run_with};

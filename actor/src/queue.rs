@@ -120,6 +120,7 @@ mod tests {
             last_version: PolicyVersion::default(),
             columns: Vec::new(),
             end: None,
+            trace: None,
         }
     }
 

@@ -4,10 +4,13 @@
 //! limp or all env steps, so that env steps are counted exactly.
 
 use std::collections::BTreeMap;
+use std::time::SystemTime;
 
 use bytes::Bytes;
 use getup_proto::columns::{self, ACTION, BETA, OBSERVATION, REWARD};
-use getup_proto::{EpisodeEnd, PolicyVersion, Rows, RunSpec, Segment};
+use getup_proto::{EpisodeEnd, PolicyVersion, Rows, RunSpec, Segment, SegmentTrace};
+use getup_telemetry::Traces;
+use getup_telemetry::traces::SpanKind;
 use thiserror::Error;
 
 /// A run's spec asks for something that the actor or its task does not produce.
@@ -106,6 +109,9 @@ pub struct SegmentBuilder {
     observations: Vec<f32>,
     segment_env_steps: u32,
     first_version: PolicyVersion,
+    /// Where it is followed.
+    trace: Option<SegmentTrace>,
+    traces: Traces,
 }
 
 impl SegmentBuilder {
@@ -140,7 +146,14 @@ impl SegmentBuilder {
             observations: Vec::with_capacity((segment_steps + 1) * observation),
             segment_env_steps: 0,
             first_version: PolicyVersion::default(),
+            trace: None,
+            traces: Traces::default(),
         })
+    }
+
+    /// Follows some of the segments by `traces`.
+    pub fn followed_by(self, traces: Traces) -> Self {
+        Self { traces, ..self }
     }
 
     /// Begins an episode, and forgets what is left of one that was abandoned.
@@ -159,6 +172,8 @@ impl SegmentBuilder {
     pub fn push(&mut self, step: &StepRecord<'_>) -> Option<Segment> {
         if self.rewards.is_empty() {
             self.first_version = step.version;
+            let (lane, step) = (self.lane.into(), self.steps_before.into());
+            self.trace = self.traces.begin([self.writer, lane, self.episode, step]);
         }
         self.observations.extend_from_slice(step.observation);
         self.actions.extend_from_slice(step.action);
@@ -189,10 +204,19 @@ impl SegmentBuilder {
             last_version: last.version,
             columns: self.layout.iter().map(|column| self.encode(*column)).collect(),
             end: self.end(last.end),
+            trace: self.simulated(),
         };
         self.steps_before += segment.steps as u32;
         self.clear();
         segment
+    }
+
+    /// The segment's trace, its time in the lane over.
+    fn simulated(&self) -> Option<SegmentTrace> {
+        let trace = self.trace?;
+        let since = SystemTime::now();
+        self.traces.child(trace.context, ("simulate", SpanKind::Internal), trace.begun, since, Vec::new());
+        Some(SegmentTrace { since, ..trace })
     }
 
     fn encode(&self, column: Column) -> Bytes {
@@ -223,6 +247,7 @@ impl SegmentBuilder {
         self.actions.clear();
         self.observations.clear();
         self.segment_env_steps = 0;
+        self.trace = None;
     }
 }
 

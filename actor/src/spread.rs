@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use getup_proto::Segment;
+use getup_telemetry::Traces;
 use getup_telemetry::prometheus::Histogram;
 use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinSet;
@@ -16,12 +17,15 @@ use tokio::task::JoinSet;
 use crate::error::ActorError;
 use crate::link::SegmentWriter;
 use crate::queue::{Acknowledgements, QueueOutput};
+use crate::sending::Sending;
 
 /// Takes segments from `queue` until its inputs are gone, and appends each by one of `writers`; tasks of `tasks` do it.
+/// Those that are followed are, as those of the actor of this name.
 pub(crate) fn spread<W: SegmentWriter>(
     writers: Vec<W>,
     queue: QueueOutput,
     append_seconds: &Histogram,
+    (traces, actor): (Traces, &str),
     tasks: &mut JoinSet<Result<(), ActorError>>,
 ) {
     let freed = Arc::new(Notify::new());
@@ -38,6 +42,8 @@ pub(crate) fn spread<W: SegmentWriter>(
             freed: freed.clone(),
             acknowledgements: queue.acknowledgements(),
             append_seconds: append_seconds.clone(),
+            traces: traces.clone(),
+            actor: actor.to_owned(),
         }));
     }
     tasks.spawn(distribute(queue, shares, desks, freed));
@@ -84,6 +90,9 @@ struct Appending<W> {
     freed: Arc<Notify>,
     acknowledgements: Acknowledgements,
     append_seconds: Histogram,
+    traces: Traces,
+    /// The actor's name.
+    actor: String,
 }
 
 /// Numbers the segments and appends them, all that are there at a time.
@@ -99,9 +108,11 @@ async fn append<W: SegmentWriter>(mut to: Appending<W>) -> Result<(), ActorError
             sequence += 1;
             (segment.writer, segment.sequence) = (to.link.writer(), sequence);
         }
+        let sending = Sending::begin(&to.traces, &to.actor, &mut segments);
         let timer = to.append_seconds.start_timer();
         to.link.append(segments).await.map_err(ActorError::Refused)?;
         timer.observe_duration();
+        sending.acknowledged();
         to.unacknowledged.fetch_sub(count, Ordering::AcqRel);
         to.freed.notify_one();
         to.acknowledgements.acknowledge(count);

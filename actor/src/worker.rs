@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use getup_proto::RunSpec;
 use getup_sim::{GetUp, TaskConfig};
-use getup_telemetry::{Registry, Shutdown, Waits};
+use getup_telemetry::{Registry, Shutdown, Traces, Waits};
 use tokio::runtime::Handle;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
@@ -40,6 +40,8 @@ pub struct ActorSetup {
     pub beta: BetaDraw,
     /// Where the states of diverged episodes are kept.
     pub diverged_folder: PathBuf,
+    /// What follows some of its segments.
+    pub traces: Traces,
 }
 
 /// Runs an actor until `shutdown`, which then takes up to `drain_seconds`. Its segments are spread over `writers`, each
@@ -97,7 +99,8 @@ pub async fn run_with<W: SegmentWriter, L: LearnerLink>(
         metrics: metrics.clone(),
     })?;
     let mut writing = JoinSet::new();
-    spread(writers, output, &metrics.append_seconds, &mut writing);
+    let follow = (setup.traces.clone(), setup.identity.name.as_str());
+    spread(writers, output, &metrics.append_seconds, follow, &mut writing);
     let office = Office::new(&setup.identity.name, &link, updates, waits, metrics.clone());
 
     let result = tokio::select! {
@@ -159,6 +162,7 @@ impl Playing {
             beta: setup.beta,
             diverged_folder: setup.diverged_folder.clone(),
             metrics: self.metrics,
+            traces: setup.traces.clone(),
         };
         let desk = EvaluationDesk {
             task: setup.task.clone(),

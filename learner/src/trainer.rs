@@ -7,11 +7,12 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
-use getup_proto::{PolicyVersion, v1};
+use getup_proto::{PolicyVersion, TraceContext, v1};
 use getup_replay::{Minibatch, MinibatchSource, ReplayCounters, SampleError};
-use getup_telemetry::{Registry, Shutdown};
+use getup_telemetry::traces::{KeyValue, SpanKind};
+use getup_telemetry::{Registry, Shutdown, Traces};
 
 use crate::checkpoint::{Checkpoint, CheckpointError, Progress};
 use crate::config::{ConfigError, CurriculumConfig, EvaluationConfig, LearnerConfig, SacConfig};
@@ -125,6 +126,7 @@ pub struct Trainer {
     /// Updates behind the policy that was offered for evaluation last.
     evaluated_updates: u64,
     ending: Option<Ending>,
+    traces: Traces,
 }
 
 impl Trainer {
@@ -169,6 +171,7 @@ impl Trainer {
             ending: curriculum.outcome().map(Ending::Curriculum).or(already_past(&config, &progress)),
             evaluation: None,
             evaluated_updates: 0,
+            traces: Traces::default(),
             config,
             sac,
             curriculum,
@@ -192,6 +195,11 @@ impl Trainer {
         }
         trainer.show();
         Ok(trainer)
+    }
+
+    /// Ends the traces of segments that are followed with the update that each is first used in.
+    pub fn followed_by(self, traces: Traces) -> Self {
+        Self { traces, ..self }
     }
 
     /// How training ended; none while it goes on.
@@ -239,6 +247,8 @@ impl Trainer {
 
     fn learn(&mut self, mut minibatch: Minibatch) -> Result<(), TrainError> {
         let started = Instant::now();
+        let followed = std::mem::take(&mut minibatch.traces);
+        let began = (!followed.is_empty()).then(SystemTime::now);
         self.progress.count(&minibatch.counters);
         let mut batch = Batch::from_minibatch(&mut minibatch)?;
         batch.weight = minibatch.importance_weights(self.config.sac.importance_exponent as f32);
@@ -251,6 +261,9 @@ impl Trainer {
         self.metrics.phases(batch_seconds, before, self.sac.phases());
         self.metrics.updates.inc();
         self.metrics.update_seconds.observe(started.elapsed().as_secs_f64());
+        if let Some(began) = began {
+            self.updated(&followed, began);
+        }
         if self.pace.count() {
             self.metrics.losses(&losses);
             self.metrics.norms(&self.sac.norms());
@@ -281,6 +294,19 @@ impl Trainer {
             self.checkpoint();
         }
         Ok(())
+    }
+
+    /// Records an update, now over, for each segment that is followed to it.
+    fn updated(&self, followed: &[TraceContext], began: SystemTime) {
+        let now = SystemTime::now();
+        for sampled in followed {
+            let attributes = vec![
+                KeyValue::new("getup.update", self.sac.updates() as i64),
+                KeyValue::new("getup.policy_version", self.version.to_string()),
+                KeyValue::new("getup.stage", i64::from(self.curriculum.stage())),
+            ];
+            self.traces.child(*sampled, ("update", SpanKind::Consumer), began, now, attributes);
+        }
     }
 
     /// Takes every evaluation that was reported, in order, and lets the curriculum decide.

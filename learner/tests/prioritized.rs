@@ -55,6 +55,7 @@ fn segment(sequence: u64, rng: &mut ChaCha8Rng) -> Segment {
         last_version: PolicyVersion::default(),
         columns: [&positions[..], actions, &rewards, &[1.0]].map(columns::encode).to_vec(),
         end: None,
+        trace: None,
     }
 }
 

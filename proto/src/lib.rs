@@ -4,16 +4,19 @@
 //! - [`RunSpec`] names the columns of a run's transitions; [`Segment`] is a stretch of one episode that
 //!   follows it. Both are made from their wire form by `parse`, which refuses what is malformed and says why,
 //!   so that nothing behind the door checks again.
+//! - [`TraceContext`] names a place in a trace, which crosses beside what is followed.
 //! - [`columns`] turns `f32` values into the little-endian bytes of a column, and back.
 //! - [`PolicyVersion`] orders the policies of a run.
 
 pub mod columns;
 mod segment;
 mod spec;
+mod trace;
 mod version;
 
 pub use segment::{EpisodeEnd, Segment, SegmentError};
 pub use spec::{ColumnSpec, Rows, RunSpec, SpecError};
+pub use trace::{SegmentTrace, TraceContext, TraceparentError, mix};
 pub use version::PolicyVersion;
 
 /// The largest message that clients and servers of this crate's services accept, in bytes.

@@ -1,6 +1,6 @@
 //! A stretch of one episode: [`Segment`], the unit that is written, stored and evicted.
 
-use crate::{PolicyVersion, RunSpec, columns, v1};
+use crate::{PolicyVersion, RunSpec, SegmentTrace, columns, v1};
 use bytes::Bytes;
 use std::collections::BTreeMap;
 
@@ -35,6 +35,8 @@ pub struct Segment {
     pub columns: Vec<Bytes>,
     /// Set on the episode's last segment alone.
     pub end: Option<EpisodeEnd>,
+    /// Where it is followed, by what; no part of its message, and never stored.
+    pub trace: Option<SegmentTrace>,
 }
 
 /// How an episode ended.
@@ -212,10 +214,11 @@ impl Segment {
             last_version: last_version.into(),
             columns: wire.columns,
             end: wire.end.map(EpisodeEnd::from),
+            trace: None,
         })
     }
 
-    /// The segment as a message, with its checksum. Columns are shared, not copied.
+    /// The segment as a message, with its checksum and without its trace. Columns are shared, not copied.
     pub fn to_wire(&self) -> v1::Segment {
         v1::Segment {
             writer: self.writer,

@@ -17,6 +17,7 @@
 //! | `gather` | from drawn rows to contiguous columns, with n-step returns |
 //! | `selector`, `sum_tree` | [`ItemSelector`]: which transitions are drawn: uniform, prioritized, FIFO, LIFO |
 //! | `sampler` | [`Sampler`]: whose random numbers decide |
+//! | `undrawn` | segments that are followed by traces, up to their first minibatch |
 //! | `limiter` | Reverb's cursor between two bounds, a pure state machine |
 //! | `gate` | the limiter with its doors: who waits there, and for whom |
 //! | `tables` | [`Tables`]: stores by name, behind one address |
@@ -47,6 +48,7 @@ mod source;
 mod store;
 mod sum_tree;
 mod tables;
+mod undrawn;
 
 #[cfg(test)]
 #[path = "../tests/fixtures/mod.rs"]

@@ -1,6 +1,6 @@
 //! What sampling gives: [`Minibatch`], and how it is asked for: [`SampleOptions`].
 
-use getup_proto::{columns, v1};
+use getup_proto::{TraceContext, columns, v1};
 
 /// What a stream of minibatches is made of.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -53,6 +53,8 @@ pub struct Minibatch {
     pub segments: Vec<SampledSegment>,
     /// The store's totals, this minibatch included.
     pub counters: ReplayCounters,
+    /// Where segments are followed of which this is the first minibatch.
+    pub traces: Vec<TraceContext>,
 }
 
 /// A transition that was drawn from a store whose sampler is not plainly uniform.
@@ -162,6 +164,7 @@ impl Minibatch {
             keys: self.items.iter().map(|item| item.key).collect(),
             probabilities: self.items.iter().map(|item| item.probability).collect(),
             segments: self.segments.into_iter().map(SampledSegment::into_wire).collect(),
+            traceparents: self.traces.iter().map(TraceContext::to_string).collect(),
         }
     }
 
@@ -181,6 +184,8 @@ impl Minibatch {
             items: items.map(|(&key, &probability)| Item { key, probability }).collect(),
             segments,
             counters: wire.counters?.into(),
+            // What is none concerns whoever looks at traces, and not training.
+            traces: wire.traceparents.iter().take(batch).filter_map(|text| text.parse().ok()).collect(),
         })
     }
 }

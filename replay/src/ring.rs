@@ -160,6 +160,16 @@ impl Ring {
         self.slots.rows()
     }
 
+    /// Numbers of the segments in the ring, from the oldest to the one after the newest; some between may have left.
+    pub(crate) fn numbers(&self) -> Range<u64> {
+        self.first_segment..self.first_segment + self.segments.len() as u64
+    }
+
+    /// The number of the segment that the row in `slot` belongs to.
+    pub(crate) fn number_of(&self, slot: usize) -> u64 {
+        self.first_segment + self.place_of(slot) as u64
+    }
+
     /// Bytes that a full ring takes.
     pub(crate) fn memory_bytes(&self) -> usize {
         size_of_val(self.values.as_slice())

@@ -16,12 +16,14 @@ use crate::minibatch::{
 };
 use crate::ring::{Drawn, Ring};
 use crate::sampler::Sampler;
-use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment, columns, v1};
-use getup_telemetry::{Shutdown, Waits};
+use crate::undrawn::{Followed, Undrawn};
+use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment, SegmentTrace, TraceContext, columns, v1};
+use getup_telemetry::traces::{KeyValue, SpanKind};
+use getup_telemetry::{Shutdown, Traces, Waits};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 /// How often a full disk is tried again.
 const FULL_TICK: Duration = Duration::from_millis(250);
@@ -47,6 +49,8 @@ pub struct Store {
     watermark: Arc<Watermark>,
     metrics: ReplayMetrics,
     waits: Waits,
+    traces: Traces,
+    undrawn: Undrawn,
 }
 
 /// What sampling needs.
@@ -112,9 +116,16 @@ impl Store {
             gate: Gate::new(limiter, waits.clone()),
             metrics,
             waits,
+            traces: Traces::default(),
+            undrawn: Undrawn::default(),
         };
         store.show_limiter();
         Ok(store)
+    }
+
+    /// Goes on with the traces of segments that are followed, and leads them to the minibatch that each is first in.
+    pub fn followed_by(self, traces: Traces) -> Self {
+        Self { traces, ..self }
     }
 
     /// The run's spec.
@@ -152,16 +163,24 @@ impl Store {
     ///
     /// # Errors
     /// As [`Store::append`]. False if `shutdown` ended the wait: the rest was not appended.
-    pub fn append_when_due(&self, segments: Vec<Segment>, shutdown: &Shutdown) -> Result<bool, StoreError> {
+    pub fn append_when_due(
+        &self,
+        mut segments: Vec<Segment>,
+        shutdown: &Shutdown,
+    ) -> Result<bool, StoreError> {
         let all: u64 = segments.iter().map(|segment| u64::from(segment.env_steps)).sum();
         self.check(&segments)?;
+        arrived(&mut segments);
         if let Some(_permit) = self.gate.try_admit(all) {
             return self.append_when_there_is_room(&segments, shutdown);
         }
-        for segment in segments {
+        for mut segment in segments {
             let Some(_permit) = self.gate.admit(u64::from(segment.env_steps), shutdown) else {
                 return Ok(false);
             };
+            if let Some(trace) = &mut segment.trace {
+                trace.since = SystemTime::now();
+            }
             if !self.append_when_there_is_room(&[segment], shutdown)? {
                 return Ok(false);
             }
@@ -176,8 +195,9 @@ impl Store {
     /// [`StoreError::Segment`] if a segment does not follow the spec, [`StoreError::Full`] if the disk has no room:
     /// then nothing has changed. Any other error ends all appending: what is durable is known when the store is
     /// opened again.
-    pub fn append(&self, segments: Vec<Segment>) -> Result<(), StoreError> {
+    pub fn append(&self, mut segments: Vec<Segment>) -> Result<(), StoreError> {
         self.check(&segments)?;
+        arrived(&mut segments);
         self.append_checked(&segments)
     }
 
@@ -231,6 +251,9 @@ impl Store {
             let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
             for segment in &fresh {
                 memory.ring.push(segment);
+                if let Some(trace) = segment.trace.filter(|_| self.traces.is_on()) {
+                    self.committed(&memory.ring, segment, trace);
+                }
             }
             memory.state = state;
             self.metrics.transitions.set(memory.ring.len() as i64);
@@ -314,12 +337,13 @@ impl Store {
         options: &SampleOptions,
     ) -> Result<Option<Minibatch>, StoreError> {
         let started = Instant::now();
+        let began = self.traces.is_on().then(SystemTime::now);
         let mut sampled = 0;
         let count = |total| {
             sampled = total;
             self.watermark.set_sampled(total)
         };
-        let (found, items, state, held) = if self.selects {
+        let (found, items, followed, state, held) = if self.selects {
             let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
             if !self.gate.try_sample(options.batch as u64, count)? {
                 return Ok(None);
@@ -330,7 +354,7 @@ impl Store {
             let item =
                 |drawn: &Drawn| Item { key: ring.key(drawn.slot), probability: drawn.probability as f32 };
             let items = drawn.iter().map(item).collect();
-            (found(ring, &drawn, options), items, memory.state, ring.len())
+            (found(ring, &drawn, options), items, self.followed(ring, &drawn), memory.state, ring.len())
         } else {
             if !self.gate.try_sample(options.batch as u64, count)? {
                 return Ok(None);
@@ -338,14 +362,41 @@ impl Store {
             let memory = self.memory();
             let drawn = sampler.draw_uniformly(&memory.ring, options.batch);
             let found = found(&memory.ring, &drawn, options);
-            (found, Vec::new(), memory.state, memory.ring.len())
+            (found, Vec::new(), self.followed(&memory.ring, &drawn), memory.state, memory.ring.len())
         };
         let counters = self.counters_of(state, sampled, held);
         self.metrics.sampled.inc_by(options.batch as u64);
         self.metrics.sample_seconds.observe(started.elapsed().as_secs_f64());
         self.show_limiter();
         let (columns, segments) = found;
-        Ok(Some(Minibatch { columns, items, segments, counters }))
+        let sampled = |followed: Followed| self.sampled(&followed, began, options.batch);
+        let traces = followed.into_iter().map(sampled).collect();
+        Ok(Some(Minibatch { columns, items, segments, counters, traces }))
+    }
+
+    /// Records what befell a segment that is followed up to now, when it has entered the ring as the newest.
+    fn committed(&self, ring: &Ring, segment: &Segment, trace: SegmentTrace) {
+        let now = SystemTime::now();
+        let SegmentTrace { context, begun, since } = trace;
+        self.traces.child(context, ("limiter", SpanKind::Internal), begun, since, Vec::new());
+        let sequence = KeyValue::new("getup.sequence", segment.sequence as i64);
+        self.traces.child(context, ("commit", SpanKind::Consumer), since, now, vec![sequence]);
+        self.undrawn.insert(ring.numbers(), context, now);
+    }
+
+    /// The segments that are followed of which one of `drawn` is the first draw.
+    fn followed(&self, ring: &Ring, drawn: &[Drawn]) -> Vec<Followed> {
+        self.undrawn.take(drawn.iter().map(|drawn| ring.number_of(drawn.slot)))
+    }
+
+    /// Records that a segment that is followed is in a minibatch for the first time; returns where its trace goes on.
+    fn sampled(&self, followed: &Followed, began: Option<SystemTime>, batch: usize) -> TraceContext {
+        let &Followed { context, since, .. } = followed;
+        let from = began.map_or(since, |began| began.max(since));
+        let waited = from.duration_since(since).unwrap_or_default().as_secs_f64();
+        let attributes =
+            vec![KeyValue::new("getup.batch", batch as i64), KeyValue::new("getup.undrawn_seconds", waited)];
+        self.traces.child(context, ("sample", SpanKind::Producer), from, SystemTime::now(), attributes)
     }
 
     /// Gives transitions priorities, by their keys; returns how many were there to get them. A priority of 0 is the
@@ -439,6 +490,13 @@ impl Store {
 
     fn memory(&self) -> RwLockReadGuard<'_, Memory> {
         self.memory.read().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Those of the segments that are followed are here now, whatever befell them in this process before.
+fn arrived(segments: &mut [Segment]) {
+    for trace in segments.iter_mut().filter_map(|segment| segment.trace.as_mut()) {
+        *trace = SegmentTrace::arrived(trace.context);
     }
 }
 

@@ -184,7 +184,7 @@ fn a_writer_that_is_cut_off_in_the_middle_is_taken_up_where_it_was_durable() {
         replay.runtime.block_on(async {
             for sequence in next..next + 10 {
                 let message = Some(common::message(&segment(&replay.spec, 1, sequence, STEPS)));
-                let _ = requests.send(v1::AppendRequest { message }).await;
+                let _ = requests.send(v1::AppendRequest { message, ..Default::default() }).await;
             }
             // Gone at another moment each time, with segments on their way.
             tokio::time::sleep(Duration::from_micros(150 * round)).await;

@@ -106,7 +106,8 @@ fn requests_are_parsed_or_refused() {
     };
     let sample =
         v1::SampleRequest { message: Some(v1::sample_request::Message::Hello(hello)) }.encode_to_vec();
-    let append = v1::AppendRequest { message: Some(common::hello(&spec, 1)) }.encode_to_vec();
+    let append =
+        v1::AppendRequest { message: Some(common::hello(&spec, 1)), ..Default::default() }.encode_to_vec();
     let mut specs = 0;
     let mut check_spec = |wire: Option<v1::RunSpec>| {
         if let Some(Ok(parsed)) = wire.map(RunSpec::parse) {
@@ -128,7 +129,7 @@ fn requests_are_parsed_or_refused() {
             }
             check_spec(hello.spec);
         }
-        if let Ok(v1::AppendRequest { message: Some(v1::append_request::Message::Hello(hello)) }) =
+        if let Ok(v1::AppendRequest { message: Some(v1::append_request::Message::Hello(hello)), .. }) =
             v1::AppendRequest::decode(Bytes::from(mangled(&mut rng, &append)))
         {
             check_spec(hello.spec);
@@ -215,7 +216,7 @@ fn a_running_service_refuses_every_mangled_request_and_goes_on() {
         ..v1::SampleHello::default()
     };
     let sample = |message| v1::SampleRequest { message: Some(message) }.encode_to_vec();
-    let append = |message| v1::AppendRequest { message: Some(message) }.encode_to_vec();
+    let append = |message| v1::AppendRequest { message: Some(message), ..Default::default() }.encode_to_vec();
     let priorities =
         v1::UpdatePrioritiesRequest { keys: vec![1, 2], priorities: vec![0.5; 2], ..Default::default() };
     // Each with the messages of a whole call.

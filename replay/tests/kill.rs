@@ -67,7 +67,8 @@ async fn write(endpoint: String, id: u64, acknowledged: Arc<AtomicU64>) {
     let sending = tokio::spawn(async move {
         for sequence in from.. {
             let message = Some(common::message(&segment(&spec, id, sequence, STEPS)));
-            if requests.send(getup_proto::v1::AppendRequest { message }).await.is_err() {
+            if requests.send(getup_proto::v1::AppendRequest { message, ..Default::default() }).await.is_err()
+            {
                 return;
             }
         }

@@ -212,7 +212,8 @@ fn tables_of_one_service_know_nothing_of_each_other() {
             table: table.to_owned(),
         };
         let messages = [Message::Hello(hello), common::message(&segment(spec, 1, 1, steps))];
-        let requests = messages.map(|message| v1::AppendRequest { message: Some(message) });
+        let requests =
+            messages.map(|message| v1::AppendRequest { message: Some(message), ..Default::default() });
         runtime.block_on(async {
             let mut client = ReplayClient::connect(format!("http://{endpoint}")).await.unwrap();
             let mut replies = client.append(tokio_stream::iter(requests)).await?.into_inner();

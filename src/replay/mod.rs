@@ -94,7 +94,7 @@ async fn start(
     let reading = role.waits.begin("replay", format!("the log in {} is read back", dir.display()));
     let opening = tokio::task::spawn_blocking(move || {
         let store = Store::open(&folder, &spec, &settings, metrics, role_here.waits.clone())?;
-        let default = Tables::from(Arc::new(store));
+        let default = Tables::from(Arc::new(store.followed_by(role_here.traces.clone())));
         match tables {
             Some(file) => tables::open(default, &file, &folder, &spec, &role_here),
             None => Ok(default),

@@ -32,7 +32,7 @@ pub(crate) fn open(
         let metrics = ReplayMetrics::of_table(&role.registry, &name);
         let folder = dir.join("tables").join(&name);
         let store = Store::open(&folder, &spec, &settings, metrics, role.waits.clone())?;
-        tables = tables.with(&name, Arc::new(store))?;
+        tables = tables.with(&name, Arc::new(store.followed_by(role.traces.clone())))?;
     }
     Ok(tables)
 }

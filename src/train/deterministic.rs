@@ -13,6 +13,7 @@ use getup_actor::identity::Identity;
 use getup_actor::lanes::{LaneGroup, LaneSettings};
 use getup_actor::link::{Heartbeat, Lease, PolicyUpdate};
 use getup_actor::metrics::ActorMetrics;
+use getup_actor::sending::Sending;
 use getup_learner::config::LearnerConfig;
 use getup_learner::device;
 use getup_learner::hub::Hub;
@@ -21,6 +22,7 @@ use getup_learner::trainer::{Ending, Start, Trainer};
 use getup_proto::v1;
 use getup_replay::{SampleOptions, Sampler, Store};
 use getup_sim::GetUp;
+use getup_telemetry::Traces;
 use tokio::sync::watch;
 
 use super::progress::Progress;
@@ -42,7 +44,7 @@ pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Sta
     let bar = Progress::start(role, config, Arc::clone(&hub));
     // The writer's id is part of every random draw of the lanes: here it is the number of the start.
     let identity = Identity { writer: incarnation, ..Identity::new(&config.actor.name, config.seed) };
-    let setup = crate::actor::setup(config, identity, folder.root().join("diverged"))?;
+    let setup = crate::actor::setup(config, role, identity, folder.root().join("diverged"))?;
     let options = sample_options(config, incarnation);
     store.check_options(&options)?;
     let policies = hub.subscribe(&setup.spec)?;
@@ -55,12 +57,14 @@ pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Sta
         beta: setup.beta,
         diverged_folder: setup.diverged_folder,
         metrics: ActorMetrics::new(&role.registry, &config.actor.name),
+        traces: setup.traces,
     };
     let mut turns = Turns {
         evaluator: Evaluator::new(&config.task, config.control_limit(), config.evaluation.episodes)?,
         lanes: LaneGroup::new(settings, 0, config.actor.lanes, policy)?,
         sampler: Sampler::new(options.seed),
         name: config.actor.name.clone(),
+        traces: role.traces.clone(),
         sequence: 0,
         options,
         policies,
@@ -82,6 +86,7 @@ pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Sta
 /// Everything that takes turns.
 struct Turns {
     name: String,
+    traces: Traces,
     hub: Arc<Hub>,
     policies: watch::Receiver<Arc<v1::PolicyUpdate>>,
     store: Arc<Store>,
@@ -103,7 +108,10 @@ impl Turns {
             self.sequence += 1;
             segment.sequence = self.sequence;
         }
-        Ok(self.store.append(segments)?)
+        let sending = Sending::begin(&self.traces, &self.name, &mut segments);
+        self.store.append(segments)?;
+        sending.acknowledged();
+        Ok(())
     }
 
     /// As many updates as the limiter lets through.

@@ -62,7 +62,9 @@ impl GrpcReplay {
         let last = segments.last().map_or(0, |segment| segment.sequence);
         for segment in segments.iter().filter(|segment| segment.sequence > stream.durable) {
             // A stream that has ended says why in its replies.
-            let _ = stream.requests.send(request(Message::Segment(segment.to_wire())));
+            let traceparent = segment.trace.map_or_else(String::new, |trace| trace.context.to_string());
+            let message = Some(Message::Segment(segment.to_wire()));
+            let _ = stream.requests.send(AppendRequest { message, traceparent });
         }
         while stream.durable < last {
             stream.hear().await?;
@@ -80,7 +82,8 @@ impl GrpcReplay {
             // Where a run's transitions go.
             table: String::new(),
         };
-        let _ = requests.send(request(Message::Hello(hello)));
+        let message = Some(Message::Hello(hello));
+        let _ = requests.send(AppendRequest { message, ..AppendRequest::default() });
         let replies = self.client.append(UnboundedReceiverStream::new(receiver)).await?.into_inner();
         let mut stream = AppendStream { requests, replies, durable: 0 };
         stream.hear().await?;
@@ -96,10 +99,6 @@ impl AppendStream {
         self.durable = reply.durable_sequence;
         Ok(())
     }
-}
-
-fn request(message: Message) -> AppendRequest {
-    AppendRequest { message: Some(message) }
 }
 
 impl SegmentWriter for GrpcReplay {

@@ -31,6 +31,7 @@ fn segments(sequences: std::ops::RangeInclusive<u64>) -> Vec<Segment> {
         last_version: PolicyVersion::default(),
         columns: spec().columns.iter().map(|column| Bytes::from(vec![0; column.bytes(2)])).collect(),
         end: None,
+        trace: None,
     };
     sequences.map(segment).collect()
 }

@@ -9,7 +9,7 @@ use getup_policy::{Body, Policy, PolicyShape};
 use getup_proto::{Segment, columns};
 use getup_sim::GetUp;
 use getup_sim::rollout::{RolloutFile, replay};
-use getup_telemetry::Registry;
+use getup_telemetry::{Registry, Traces};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -22,6 +22,7 @@ fn settings(setup: &ActorSetup) -> LaneSettings {
         beta: setup.beta,
         diverged_folder: setup.diverged_folder.clone(),
         metrics: ActorMetrics::new(&Registry::new(), "actor"),
+        traces: Traces::default(),
     }
 }
 

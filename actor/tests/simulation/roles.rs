@@ -127,6 +127,7 @@ pub(crate) async fn actor(run: Arc<Run>, machine: Arc<Machine>) -> turmoil::Resu
         identity: Identity::new(&machine.name, 7),
         beta: BetaDraw { std: 0.04, floor: 0.4, ceiling: 1.0 },
         diverged_folder: Default::default(),
+        traces: Default::default(),
     };
     run.ledger.started(&machine, run.replays);
     let writer = |index: usize| {

@@ -3,10 +3,11 @@
 use super::committer::Job;
 use super::{failed, shutting_down};
 use crate::store::Store;
-use getup_proto::{Segment, SegmentError, v1};
+use getup_proto::{Segment, SegmentError, SegmentTrace, v1};
 use getup_telemetry::Shutdown;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::SystemTime;
 use tokio::sync::{mpsc, oneshot, watch};
 use tonic::{Status, Streaming};
 
@@ -98,7 +99,7 @@ impl AppendStream {
     ) -> Result<(), Status> {
         let mut newest = 0;
         while let Some(request) = inbound.message().await? {
-            let segment = self.parse(request, newest)?;
+            let mut segment = self.parse(request, newest)?;
             newest = segment.sequence;
             let store = &self.visit.store;
             store.gate().heard_writer(self.visit.writer);
@@ -106,6 +107,9 @@ impl AppendStream {
                 continue;
             }
             let permit = store.gate().admit_task(u64::from(segment.env_steps)).await;
+            if let Some(trace) = &mut segment.trace {
+                trace.since = SystemTime::now();
+            }
             let job = Job::Append { segment, permit, durable: durable.clone() };
             self.jobs.send(job).await.map_err(|_| failed())?;
             taken.store(newest, Ordering::Relaxed);
@@ -126,7 +130,7 @@ impl AppendStream {
                 "a stream has one hello, and then segments: send a segment".to_owned(),
             ));
         };
-        let segment = Segment::parse(segment, self.visit.store.spec()).map_err(|error| {
+        let mut segment = Segment::parse(segment, self.visit.store.spec()).map_err(|error| {
             let status = refused(error.kind(), error.to_string());
             match error {
                 // Worth another attempt, unlike the rest.
@@ -147,6 +151,8 @@ impl AppendStream {
             );
             return Err(refused("sequence", text));
         }
+        // What is none concerns whoever looks at traces, and not the segment.
+        segment.trace = request.traceparent.parse().ok().map(SegmentTrace::arrived);
         Ok(segment)
     }
 }

@@ -95,7 +95,9 @@ impl Replay {
     pub fn outcome(&self, messages: Vec<v1::append_request::Message>) -> Result<u64, Status> {
         let mut client = self.client();
         self.runtime.block_on(async {
-            let requests = messages.into_iter().map(|message| v1::AppendRequest { message: Some(message) });
+            let requests = messages
+                .into_iter()
+                .map(|message| v1::AppendRequest { message: Some(message), ..Default::default() });
             let mut replies =
                 client.append(tokio_stream::iter(requests.collect::<Vec<_>>())).await?.into_inner();
             let mut durable = 0;
@@ -134,7 +136,9 @@ impl Writer {
         let client = ReplayClient::connect(format!("http://{endpoint}")).await;
         let mut client = client.map_err(|error| Status::unavailable(error.to_string()))?;
         let (requests, outbound) = mpsc::channel(32);
-        let _ = requests.send(v1::AppendRequest { message: Some(hello(spec, writer)) }).await;
+        let _ = requests
+            .send(v1::AppendRequest { message: Some(hello(spec, writer)), ..Default::default() })
+            .await;
         let mut replies = client.append(ReceiverStream::new(outbound)).await?.into_inner();
         let durable = next(&mut replies).await?;
         Ok(Self { requests, replies, durable })
@@ -142,7 +146,10 @@ impl Writer {
 
     /// Sends a segment; an error if the service has gone.
     pub async fn send(&self, segment: &Segment) -> Result<(), Status> {
-        let sent = self.requests.send(v1::AppendRequest { message: Some(message(segment)) }).await;
+        let sent = self
+            .requests
+            .send(v1::AppendRequest { message: Some(message(segment)), ..Default::default() })
+            .await;
         sent.map_err(|_| Status::unavailable("the stream has ended"))
     }
 

@@ -13,7 +13,7 @@ use getup_policy::{Body, Policy, PolicyShape};
 use getup_proto::columns::{ACTION, BETA, OBSERVATION, REWARD};
 use getup_proto::{ColumnSpec, PolicyVersion, Rows, RunSpec};
 use getup_sim::TaskConfig;
-use getup_telemetry::Shutdown;
+use getup_telemetry::{Shutdown, Traces};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use tokio::net::TcpListener;
@@ -60,6 +60,7 @@ pub(crate) fn setup(folder: &Path) -> ActorSetup {
         identity: Identity { name: "actor-1".to_owned(), run_seed: 7, writer: 1 },
         beta: BetaDraw { std: 0.04, floor: 0.4, ceiling: 1.0 },
         diverged_folder: folder.to_owned(),
+        traces: Traces::default(),
     }
 }
 

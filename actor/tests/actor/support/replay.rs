@@ -84,7 +84,8 @@ impl Replay for Store {
         request: Request<Streaming<AppendRequest>>,
     ) -> Result<Response<Self::AppendStream>, Status> {
         let mut requests = request.into_inner();
-        let Some(AppendRequest { message: Some(Message::Hello(hello)) }) = requests.message().await? else {
+        let Some(AppendRequest { message: Some(Message::Hello(hello)), .. }) = requests.message().await?
+        else {
             return Err(Status::invalid_argument("the first message is no hello"));
         };
         let theirs = RunSpec::parse(hello.spec.unwrap_or_default())
@@ -94,7 +95,7 @@ impl Replay for Store {
         let store = self.clone();
         let mut stored = 0;
         let replies = requests.filter_map(move |request| match request {
-            Ok(AppendRequest { message: Some(Message::Segment(wire)) }) => {
+            Ok(AppendRequest { message: Some(Message::Segment(wire)), .. }) => {
                 match Segment::parse(wire, &spec()) {
                     Ok(segment) => store.store(segment, &mut stored),
                     Err(error) => Some(Err(Status::invalid_argument(error.to_string()))),
