@@ -53,6 +53,25 @@ fn two_streams_of_one_writer_store_each_segment_once() {
 }
 
 #[test]
+fn a_traceparent_that_is_none_or_that_nobody_follows_leaves_the_segment_as_it_is() {
+    let replay = Replay::start(spec(8), &config());
+    let mut writer = replay.writer(1);
+    replay.runtime.block_on(async {
+        let followed = "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01";
+        for (sequence, traceparent) in [(1, "a trace"), (2, followed)] {
+            let message = Some(message(&segment(&replay.spec, 1, sequence, 8)));
+            let request = v1::AppendRequest { message, traceparent: traceparent.to_owned() };
+            writer.requests.send(request).await.unwrap();
+        }
+        writer.acknowledged(2).await.unwrap();
+    });
+    assert_eq!(replay.store.len(), 16);
+    let (store, shutdown) = (replay.store.clone(), replay.shutdown.clone());
+    let mut source = LocalSource::new(store, options(16), "learner", shutdown).unwrap();
+    assert!(source.next().unwrap().traces.is_empty(), "without a collector no trace goes on");
+}
+
+#[test]
 fn what_is_wrong_is_refused_with_its_reason_and_changes_nothing() {
     let replay = Replay::start(spec(8), &config());
     let good = segment(&replay.spec, 1, 1, 4);
