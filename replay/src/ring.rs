@@ -34,8 +34,8 @@ pub(crate) struct Ring {
     /// A row in each slot.
     values: Vec<f32>,
     slots: Slots,
-    /// The segments from the oldest on that is in the ring; those after it that have left keep their place, with no
-    /// steps.
+    /// From the oldest that is in the ring on; those after it that have left keep their places, with no steps. All are
+    /// within the window.
     segments: VecDeque<Entry>,
     /// Number of the oldest segment.
     first_segment: u64,
@@ -278,7 +278,7 @@ impl Ring {
     /// The segment that continues the episode, where it is there.
     pub(crate) fn continuation(&self, entry: &Entry) -> Option<&Entry> {
         let number = entry.continued_by?;
-        // It came later than the entry, and the places of those that came before it are kept.
+        // It came after the entry, and what comes after one that is there keeps its place.
         self.segments.get((number - self.first_segment) as usize).filter(|entry| entry.steps > 0)
     }
 
