@@ -38,8 +38,15 @@ const PEER_REQUIREMENTS: &[&str] = &["torch==2.11.0", "numpy==2.3.5"];
 /// What `benches/replay.rs` compares with, in an environment of its own: it needs an older NumPy.
 const REVERB_REQUIREMENTS: &[&str] =
     &["dm-reverb[tensorflow]==0.14.0", "tensorflow==2.15.1", "numpy==1.26.4"];
-/// What exported stores are read with, in tests.
-const READER_REQUIREMENTS: &[&str] = &["minari[arrow]==0.5.4", "numpy==2.2.6"];
+/// What tests read exported stores with, and what they check `deploy/` against: the schemas of Compose, Grafana (for
+/// Python 3.11 and later) and Kubernetes.
+const READER_REQUIREMENTS: &[&str] = &[
+    "minari[arrow]==0.5.4",
+    "numpy==2.2.6",
+    "check-jsonschema==0.39.0",
+    "grafana-foundation-sdk==1769699379!11.6.0; python_version >= '3.11'",
+    "kubernetes-validate==1.37.0",
+];
 /// What `docs/curves.py` and `docs/dashboards.py` draw with; tomli reads TOML where Python does not yet.
 const PLOT_REQUIREMENTS: &[&str] = &["matplotlib==3.10.9", "tomli==2.5.0; python_version < '3.11'"];
 
@@ -67,7 +74,7 @@ pub(crate) fn peers_python() -> PathBuf {
     native().join("peers/bin/python")
 }
 
-/// The Python that has NumPy and Minari.
+/// The Python that has what tests read with.
 pub(crate) fn readers_python() -> PathBuf {
     native().join("readers/bin/python")
 }
@@ -105,13 +112,13 @@ pub(crate) fn set_up_plots() -> Result<()> {
     set_up_environment("plots", &plots_python(), PLOT_REQUIREMENTS, "matplotlib for the figures (200 MB)")
 }
 
-/// Makes the environment that tests read exported stores in.
+/// Makes the environment that tests read exports and manifests in.
 pub(crate) fn set_up_readers() -> Result<()> {
     set_up_environment(
         "readers",
         &readers_python(),
         READER_REQUIREMENTS,
-        "NumPy and Minari for the tests (300 MB)",
+        "NumPy, Minari and schemas for the tests (500 MB)",
     )
 }
 
