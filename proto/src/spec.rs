@@ -100,12 +100,13 @@ pub enum SpecError {
     },
     /// The peer speaks another version of the protocol.
     #[error(
-        "the peer speaks version {theirs} of the protocol, this getup {OLDEST_PROTOCOL} to {PROTOCOL}: upgrade {older}"
+        "the sender speaks version {theirs} of the protocol, the receiver {OLDEST_PROTOCOL} to {PROTOCOL}: upgrade the \
+         {older}"
     )]
     Protocol {
         /// As it says; 0 is from before there were versions.
         theirs: u32,
-        /// Whose getup is too old.
+        /// Whose getup is too old; both sides read this.
         older: &'static str,
     },
     /// Two specs that should be the same are not.
@@ -138,9 +139,9 @@ impl RunSpec {
     pub fn parse(wire: v1::RunSpec) -> Result<Self, SpecError> {
         match wire.protocol {
             theirs if theirs < OLDEST_PROTOCOL => {
-                return Err(SpecError::Protocol { theirs, older: "the peer" });
+                return Err(SpecError::Protocol { theirs, older: "sender" });
             }
-            theirs if theirs > PROTOCOL => return Err(SpecError::Protocol { theirs, older: "this one" }),
+            theirs if theirs > PROTOCOL => return Err(SpecError::Protocol { theirs, older: "receiver" }),
             _ => {}
         }
         let columns = wire.columns.into_iter().map(ColumnSpec::parse).collect::<Result<_, _>>()?;
@@ -315,8 +316,8 @@ mod tests {
     fn another_protocol_is_refused_by_who_has_to_upgrade() {
         let of =
             |protocol| RunSpec::parse(v1::RunSpec { protocol, ..spec().to_wire() }).unwrap_err().to_string();
-        assert!(of(OLDEST_PROTOCOL - 1).ends_with("upgrade the peer"));
-        assert!(of(PROTOCOL + 1).ends_with("upgrade this one"));
+        assert!(of(OLDEST_PROTOCOL - 1).ends_with("upgrade the sender"));
+        assert!(of(PROTOCOL + 1).ends_with("upgrade the receiver"));
     }
 
     #[test]
