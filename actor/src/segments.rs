@@ -204,7 +204,7 @@ impl SegmentBuilder {
             last_version: last.version,
             columns: self.layout.iter().map(|column| self.encode(*column)).collect(),
             end: self.end(last.end),
-            trace: self.simulated(),
+            trace: self.simulated().map(Box::new),
         };
         self.steps_before += segment.steps as u32;
         self.clear();

@@ -28,9 +28,9 @@ impl Sending {
         let follow = |segment: &mut Segment| {
             let attributes = attributes(actor, segment);
             let trace = segment.trace.as_mut()?;
-            let whole = *trace;
+            let whole = **trace;
             traces.child(whole.context, ("queue", SpanKind::Internal), whole.since, begun, Vec::new());
-            *trace = SegmentTrace { context: whole.context.child(APPEND), since: begun, ..whole };
+            **trace = SegmentTrace { context: whole.context.child(APPEND), since: begun, ..whole };
             Some((whole, attributes))
         };
         let followed =

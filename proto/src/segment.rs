@@ -36,7 +36,7 @@ pub struct Segment {
     /// Set on the episode's last segment alone.
     pub end: Option<EpisodeEnd>,
     /// Where it is followed, by what; no part of its message, and never stored.
-    pub trace: Option<SegmentTrace>,
+    pub trace: Option<Box<SegmentTrace>>,
 }
 
 /// How an episode ended.

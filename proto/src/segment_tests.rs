@@ -150,7 +150,7 @@ fn a_segment_without_a_policy_version_is_refused() {
 fn a_trace_is_no_part_of_what_is_sent_as_a_segment_and_stored() {
     let plain = segment(3, 0.5);
     let context = crate::TraceContext { trace_id: 1, span_id: 2 };
-    let traced = Segment { trace: Some(crate::SegmentTrace::arrived(context)), ..plain.clone() };
+    let traced = Segment { trace: Some(Box::new(crate::SegmentTrace::arrived(context))), ..plain.clone() };
     assert_eq!(traced.to_wire(), plain.to_wire());
     assert_eq!(Segment::parse(traced.to_wire(), &spec()), Ok(plain));
 }

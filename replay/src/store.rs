@@ -251,8 +251,8 @@ impl Store {
             let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
             for segment in &fresh {
                 memory.ring.push(segment);
-                if let Some(trace) = segment.trace.filter(|_| self.traces.is_on()) {
-                    self.committed(&memory.ring, segment, trace);
+                if let Some(trace) = segment.trace.as_deref().filter(|_| self.traces.is_on()) {
+                    self.committed(&memory.ring, segment, *trace);
                 }
             }
             memory.state = state;
@@ -496,7 +496,7 @@ impl Store {
 /// Those of the segments that are followed are here now, whatever befell them in this process before.
 fn arrived(segments: &mut [Segment]) {
     for trace in segments.iter_mut().filter_map(|segment| segment.trace.as_mut()) {
-        *trace = SegmentTrace::arrived(trace.context);
+        **trace = SegmentTrace::arrived(trace.context);
     }
 }
 

@@ -176,7 +176,7 @@ impl Traces {
         let exporter = Counted { exporter, endpoint: config.endpoint.clone(), toll: toll.clone() };
         let mut processor = BatchSpanProcessor::new(exporter, batches.build());
         processor.set_resource(&resource(who));
-        tracing::info!("of {} of the segments traces go to {}", config.share, config.endpoint);
+        tracing::info!(share = config.share, "traces of segments go to {}", config.endpoint);
         let (seed, share) = (who.seed, config.share);
         Ok(Self(Some(Arc::new(Exporting { seed, share, processor, toll, runtime: Some(runtime) }))))
     }

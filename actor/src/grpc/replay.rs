@@ -62,7 +62,8 @@ impl GrpcReplay {
         let last = segments.last().map_or(0, |segment| segment.sequence);
         for segment in segments.iter().filter(|segment| segment.sequence > stream.durable) {
             // A stream that has ended says why in its replies.
-            let traceparent = segment.trace.map_or_else(String::new, |trace| trace.context.to_string());
+            let traceparent =
+                segment.trace.as_ref().map_or_else(String::new, |trace| trace.context.to_string());
             let message = Some(Message::Segment(segment.to_wire()));
             let _ = stream.requests.send(AppendRequest { message, traceparent });
         }

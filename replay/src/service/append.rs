@@ -152,7 +152,7 @@ impl AppendStream {
             return Err(refused("sequence", text));
         }
         // What is none concerns whoever looks at traces, and not the segment.
-        segment.trace = request.traceparent.parse().ok().map(SegmentTrace::arrived);
+        segment.trace = request.traceparent.parse().ok().map(SegmentTrace::arrived).map(Box::new);
         Ok(segment)
     }
 }
