@@ -22,10 +22,11 @@ const HEARD_SECONDS: f64 = 5.0;
 /// The plan is a TOML file. `prelude` is shell code put before every command, `observe` a command that prints `getup
 /// status --json` of the cluster. Each `[[fault]]` has a `name`, a command `inject`, perhaps a command `heal`, `hold`
 /// (seconds between the two) and `within` (seconds in which the cluster must be well again). It is well when the learner
-/// makes updates, the replay stores env steps, and as many actors are heard as before. And it must never have lost
-/// anything: what the replays hold, the curriculum's stage, and the policies' versions only grow.
+/// makes updates, the replay stores env steps, and as many actors are heard as before; with `trains = true` it must be so
+/// while the fault holds, too. And it must never have lost anything: what the replays hold, the curriculum's stage, and
+/// the policies' versions only grow. A fault whose command `needs` fails is skipped.
 ///
-/// deploy/chaos.toml is the plan for a cluster of docker compose.
+/// Commands find this program as $GETUP. deploy/chaos.toml is the plan for a cluster of docker compose.
 #[derive(clap::Args)]
 pub(crate) struct Args {
     /// The plan.
@@ -68,7 +69,11 @@ struct Fault {
     #[serde(default)]
     heal: String,
     #[serde(default)]
+    needs: String,
+    #[serde(default)]
     hold: f64,
+    #[serde(default)]
+    trains: bool,
     #[serde(default = "default_within")]
     within: f64,
 }
@@ -82,6 +87,8 @@ fn default_within() -> f64 {
 struct Outcome<'a> {
     fault: &'a str,
     passed: bool,
+    /// The cluster lacks what the fault needs: it was not tried.
+    skipped: bool,
     /// From the end of the fault until the cluster was well.
     recovered_seconds: Option<f64>,
     problem: Option<String>,
@@ -112,15 +119,20 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let mut failed = 0;
     for fault in sequence(faults, arguments.soak, arguments.seed) {
         let outcome = plan.try_fault(fault);
-        failed += usize::from(!outcome.passed);
+        failed += usize::from(!outcome.passed && !outcome.skipped);
         if arguments.json {
             println!("{}", serde_json::to_string(&outcome)?);
         } else {
             let recovered = outcome.recovered_seconds;
             let recovered =
                 recovered.map_or_else(String::new, |seconds| format!(", well again after {seconds:.1} s"));
-            let problem = outcome.problem.map_or_else(String::new, |problem| format!(": {problem}"));
-            println!("{} {}{recovered}{problem}", if outcome.passed { "pass" } else { "FAIL" }, fault.name);
+            let problem = outcome.problem.as_ref().map_or_else(String::new, |problem| format!(": {problem}"));
+            let verdict = match outcome {
+                Outcome { skipped: true, .. } => "skip",
+                Outcome { passed: true, .. } => "pass",
+                _ => "FAIL",
+            };
+            println!("{verdict} {}{recovered}{problem}", fault.name);
         }
     }
     ensure!(failed == 0, "the cluster did not come through {failed} of its faults");
@@ -140,6 +152,18 @@ fn sequence(faults: Vec<&Fault>, soak: Option<f64>, seed: u64) -> Box<dyn Iterat
 
 impl Plan {
     fn try_fault<'a>(&self, fault: &'a Fault) -> Outcome<'a> {
+        if !fault.needs.is_empty()
+            && let Err(error) = self.shell(&fault.needs)
+        {
+            let problem = Some(format!("{error:#}"));
+            return Outcome {
+                fault: &fault.name,
+                passed: false,
+                skipped: true,
+                recovered_seconds: None,
+                problem,
+            };
+        }
         let (recovered, problem) = match self.break_and_watch(fault) {
             Ok(recovered) if recovered.as_secs_f64() <= fault.within => (Some(recovered), None),
             Ok(recovered) => (Some(recovered), Some(format!("it may take {} s", fault.within))),
@@ -148,6 +172,7 @@ impl Plan {
         Outcome {
             fault: &fault.name,
             passed: problem.is_none(),
+            skipped: false,
             recovered_seconds: recovered.map(|time| time.as_secs_f64()),
             problem,
         }
@@ -159,10 +184,13 @@ impl Plan {
         let patience = Duration::from_secs(60);
         let before = self.wait_until_well(None, Instant::now(), patience).context("before the fault")?.0;
         self.shell(&fault.inject).context("inject")?;
-        std::thread::sleep(Duration::from_secs_f64(fault.hold));
+        let (injected, hold) = (Instant::now(), Duration::from_secs_f64(fault.hold));
+        let during = fault.trains.then(|| self.wait_until_well(Some(&before), injected, hold));
+        std::thread::sleep(hold.saturating_sub(injected.elapsed()));
         if !fault.heal.is_empty() {
             self.shell(&fault.heal).context("heal")?;
         }
+        during.transpose().context("during the fault")?;
         // Later than it may, it is still worth knowing when.
         let patience = Duration::from_secs_f64(fault.within + 60.0);
         Ok(self.wait_until_well(Some(&before), Instant::now(), patience)?.1)
@@ -209,7 +237,9 @@ impl Plan {
 
     fn shell(&self, command: &str) -> Result<String> {
         let script = format!("{}\n{command}", self.prelude);
-        let output = Command::new("bash").args(["-ec", &script]).output().context("cannot start bash")?;
+        let getup = std::env::current_exe().context("this program's file is not known")?;
+        let mut bash = Command::new("bash");
+        let output = bash.args(["-ec", &script]).env("GETUP", getup).output().context("cannot start bash")?;
         let stderr = String::from_utf8_lossy(&output.stderr);
         ensure!(output.status.success(), "{} ({})", stderr.trim(), output.status);
         Ok(String::from_utf8_lossy(&output.stdout).into_owned())

@@ -7,6 +7,7 @@ mod actor;
 mod certs;
 mod chaos;
 mod config;
+mod delay;
 mod doctor;
 mod evaluate;
 mod falls;
@@ -57,6 +58,8 @@ enum Command {
     Doctor(doctor::Args),
     Certs(certs::Args),
     Chaos(chaos::Args),
+    #[command(hide = true)]
+    Delay(delay::Args),
     Health(health::Args),
     Status(status::Args),
 }
@@ -77,6 +80,7 @@ fn main() -> ExitCode {
         Command::Doctor(arguments) => doctor::run(arguments),
         Command::Certs(arguments) => certs::run(arguments),
         Command::Chaos(arguments) => chaos::run(arguments),
+        Command::Delay(arguments) => delay::run(arguments),
         Command::Health(arguments) => health::run(arguments),
         Command::Status(arguments) => status::run(arguments),
     };
