@@ -18,8 +18,8 @@ const FILE: &str = "store.json";
 #[derive(Clone, PartialEq, Eq, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Manifest {
-    format: u64,
-    /// Names the store; drawn at its creation, never 0.
+    pub(super) format: u64,
+    /// Names the store, and its snapshots; drawn at its creation, never 0.
     pub(crate) store: u64,
     pub(crate) spec: RunSpec,
 }

@@ -23,6 +23,8 @@ pub(crate) struct Snapshot {
     /// Where it is put together, and where it goes then.
     unfinished: PathBuf,
     dir: PathBuf,
+    /// The store's name: a learner that goes on with the copy has counted what is in it.
+    store: u64,
     state: State,
     marks: Vec<(u64, Mark)>,
     sampled: u64,
@@ -61,6 +63,7 @@ impl Log {
         Ok(Snapshot {
             unfinished,
             dir: dir.to_owned(),
+            store: self.store,
             state: self.state,
             marks: self.writers.iter().collect(),
             sampled: self.watermark.sampled()?,
@@ -77,7 +80,7 @@ impl Snapshot {
 
     /// Copies the rest, and gives the snapshot its name: it is there whole, or not at all.
     pub(crate) fn finish(self, spec: &RunSpec) -> Result<(), StoreError> {
-        let Self { unfinished, dir, state, marks, sampled, newest } = self;
+        let Self { unfinished, dir, store, state, marks, sampled, newest } = self;
         if let Some((first, file, bytes)) = newest {
             let to = files::path(&unfinished, first);
             let copy = || io::copy(&mut file.take(bytes), &mut File::create_new(&to)?);
@@ -89,7 +92,7 @@ impl Snapshot {
         let watermark = Watermark::create(&unfinished)?;
         watermark.set_acknowledged(state.segments)?;
         watermark.set_sampled(sampled)?;
-        Manifest::new(spec).write(&unfinished)?;
+        Manifest { store, ..Manifest::new(spec) }.write(&unfinished)?;
         fs::rename(&unfinished, &dir).map_err(StoreError::io("move", &dir))
     }
 }
