@@ -30,6 +30,8 @@
 mod common;
 #[path = "../replay/tests/fixtures/mod.rs"]
 mod fixtures;
+#[path = "../src/bench/load.rs"]
+mod load;
 
 use std::fs;
 use std::hint::black_box;
@@ -43,7 +45,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, Result, bail, ensure};
 use common::{Row, report};
-use fixtures::{Ending, Part, get_up_spec};
+use fixtures::get_up_spec;
 use getup_actor::link::{BETA_VALUE, HIGH_STARTS_VALUE, LearnerLink, POLICY_NETWORK, SegmentWriter};
 use getup_actor::{GrpcLearner, GrpcReplay, Heartbeat, Identity, LinkError, PolicyUpdate};
 use getup_learner::hub::Hub;
@@ -56,6 +58,7 @@ use getup_replay::{
 };
 use getup_telemetry::{Registry, Shutdown, Waits, health};
 use getup_transport::{Credentials, Endpoint, Limits, Metrics, Server, Window};
+use load::{episode, percentiles};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
@@ -82,7 +85,6 @@ const MOST_MINIBATCHES: f64 = 740.0;
 /// Minibatches ahead, as a learner has them.
 const PREFETCH: usize = 8;
 const STEPS: usize = 64;
-const EPISODE: usize = 250;
 const WARM_UP: Duration = Duration::from_secs(2);
 const TIME: Duration = Duration::from_secs(8);
 /// How long all actors may take to connect.
@@ -475,7 +477,7 @@ fn run_load(replay: &str, learner: &str, actors: u64) -> Result<()> {
     let shutdown = Shutdown::new();
     run(&shutdown, async {
         let seen = Arc::new(Mutex::new(Seen::default()));
-        let segments: Arc<[Segment]> = (0..8).flat_map(episode).collect();
+        let segments: Arc<[Segment]> = (0..8).flat_map(|number| episode(&get_up_spec(), number)).collect();
         let (arrived, mut arrivals) = mpsc::unbounded_channel();
         let mut tasks = JoinSet::new();
         for number in 0..actors {
@@ -590,18 +592,6 @@ async fn send_heartbeats(
     }
 }
 
-/// An episode of 250 steps, cut.
-fn episode(number: u64) -> Vec<Segment> {
-    let spec = get_up_spec();
-    let cut = |first_step: usize| {
-        let steps = STEPS.min(EPISODE - first_step);
-        let ending = if first_step + steps == EPISODE { Ending::Truncated } else { Ending::None };
-        let first_step = first_step as u32;
-        Part { writer: 1, sequence: 1, lane: 0, episode: number, first_step, steps, ending }.build(&spec)
-    };
-    (0..EPISODE).step_by(STEPS).map(cut).collect()
-}
-
 impl Seen {
     fn summary(self, seconds: f64) -> Value {
         let policies = self.lags.len() as f64 / seconds;
@@ -618,13 +608,6 @@ impl Seen {
             "env_steps": self.env_steps as f64 / seconds,
         })
     }
-}
-
-/// None where there are no values.
-fn percentiles<const N: usize>(mut values: Vec<f64>, shares: [f64; N]) -> [Option<f64>; N] {
-    values.sort_by(f64::total_cmp);
-    let last = values.len().saturating_sub(1);
-    shares.map(|share| values.get((last as f64 * share).round() as usize).copied())
 }
 
 fn lock(seen: &Mutex<Seen>) -> MutexGuard<'_, Seen> {

@@ -4,6 +4,7 @@
 //! `getup-actor`, `getup-learner`, `getup-replay`, `getup-sim`.
 
 mod actor;
+mod bench;
 mod certs;
 mod chaos;
 mod config;
@@ -57,6 +58,7 @@ enum Command {
     Falls(falls::Args),
     Doctor(doctor::Args),
     Certs(certs::Args),
+    Bench(bench::Args),
     Chaos(chaos::Args),
     #[command(hide = true)]
     Delay(delay::Args),
@@ -79,6 +81,7 @@ fn main() -> ExitCode {
         Command::Falls(arguments) => falls::run(arguments),
         Command::Doctor(arguments) => doctor::run(arguments),
         Command::Certs(arguments) => certs::run(arguments),
+        Command::Bench(arguments) => bench::run(arguments),
         Command::Chaos(arguments) => chaos::run(arguments),
         Command::Delay(arguments) => delay::run(arguments),
         Command::Health(arguments) => health::run(arguments),

@@ -20,6 +20,7 @@ pub struct GrpcReplay {
     peer: String,
     spec: RunSpec,
     identity: Identity,
+    table: String,
     waits: Waits,
     backoff: Backoff,
     stream: Option<AppendStream>,
@@ -50,7 +51,14 @@ impl GrpcReplay {
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         let peer = format!("replay at {}", endpoint.address);
-        Ok(Self { client, peer, spec, identity, waits, backoff: Backoff::new(), stream: None })
+        // Where a run's transitions go.
+        let table = String::new();
+        Ok(Self { client, peer, spec, identity, table, waits, backoff: Backoff::new(), stream: None })
+    }
+
+    /// Appends to this table instead of the default one.
+    pub fn in_table(self, table: &str) -> Self {
+        Self { table: table.to_owned(), ..self }
     }
 
     /// Sends what is not durable of `segments`, and returns when all of it is.
@@ -80,8 +88,7 @@ impl GrpcReplay {
             spec: Some(self.spec.to_wire()),
             writer: self.identity.writer,
             name: self.identity.name.clone(),
-            // Where a run's transitions go.
-            table: String::new(),
+            table: self.table.clone(),
         };
         let message = Some(Message::Hello(hello));
         let _ = requests.send(AppendRequest { message, ..AppendRequest::default() });
