@@ -198,7 +198,7 @@ impl Ring {
     pub(crate) fn draw_uniformly(&self, rng: &mut impl Rng) -> Drawn {
         loop {
             // Rows are uniform, and so are those of them that begin a transition: all but one a segment.
-            let slot = self.nth_row(rng.random_range(0..self.rows()));
+            let slot = self.nth_row(rng.random_range(0..self.rows() as u64) as usize);
             if self.steps_from(slot) > 0 {
                 return Drawn { slot, probability: 1.0 / self.transitions as f64 };
             }

@@ -58,6 +58,7 @@ impl Slots {
     }
 
     /// Rows that take one.
+    #[inline]
     pub(crate) fn rows(&self) -> usize {
         match self {
             Self::InOrder(order) => order.rows,
@@ -110,6 +111,7 @@ impl Slots {
     }
 
     /// The slot of the row after the one in `slot`, in the same segment.
+    #[inline]
     pub(crate) fn after(&self, slot: usize) -> usize {
         match self {
             Self::InOrder(order) => {
@@ -137,6 +139,7 @@ impl Slots {
     }
 
     /// The slot of the `n`th row from the oldest, where rows are in order; else the slot `n`.
+    #[inline]
     pub(crate) fn nth(&self, n: usize) -> usize {
         match self {
             Self::InOrder(order) => order.nth(n),
@@ -146,15 +149,18 @@ impl Slots {
 }
 
 impl InOrder {
+    #[inline]
     fn nth(&self, n: usize) -> usize {
         self.wrapped(self.first + n)
     }
 
     /// How many rows are older than the one in `slot`.
+    #[inline]
     pub(crate) fn age(&self, slot: usize) -> usize {
         if slot < self.first { slot + self.slots - self.first } else { slot - self.first }
     }
 
+    #[inline]
     fn wrapped(&self, slot: usize) -> usize {
         if slot < self.slots { slot } else { slot - self.slots }
     }

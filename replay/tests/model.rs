@@ -10,16 +10,20 @@ use getup_replay::{ItemSelector, Remover, ReplayConfig, SampleOptions, Sampler, 
 use proptest::prelude::*;
 use proptest::sample::Index;
 use std::collections::HashMap;
+use std::path::Path;
 use tempfile::TempDir;
 
 const STEPS: usize = 8;
+/// Transitions of the longest commit, of appends and of compactions.
+const COMMIT: usize = 11 * STEPS;
+const COMPACTED: usize = 64 * STEPS;
 
 #[derive(Clone, Debug)]
 enum Action {
     /// A group commit of these lengths, by these writers; some repeat an old sequence number.
     Append(Vec<(u64, usize, bool)>),
     Sample(usize, usize),
-    /// Priorities for transitions, counted from the newest ever stored.
+    /// Priorities for the transitions of segments, counted from the newest ever stored.
     Prioritize(Vec<(Index, f32)>),
     Restart,
     Compact,
@@ -29,9 +33,9 @@ fn action() -> impl Strategy<Value = Action> {
     let part = (1u64..4, 1..=STEPS, prop::bool::weighted(0.2));
     let priority = prop_oneof![Just(0.0), Just(0.5), Just(1.0), 0.0f32..2.0];
     prop_oneof![
-        6 => prop::collection::vec(part, 1..12).prop_map(Action::Append),
-        3 => (1usize..40, 1usize..4).prop_map(|(batch, n_step)| Action::Sample(batch, n_step)),
-        3 => prop::collection::vec((any::<Index>(), priority), 1..40).prop_map(Action::Prioritize),
+        12 => prop::collection::vec(part, 1..12).prop_map(Action::Append),
+        6 => (1usize..40, 1usize..4).prop_map(|(batch, n_step)| Action::Sample(batch, n_step)),
+        9 => prop::collection::vec((any::<Index>(), priority), 1..12).prop_map(Action::Prioritize),
         1 => Just(Action::Restart),
         1 => Just(Action::Compact),
     ]
@@ -40,7 +44,7 @@ fn action() -> impl Strategy<Value = Action> {
 fn settings() -> impl Strategy<Value = ReplayConfig> {
     let lowest_priority = (1u32..6).prop_map(|window| Remover::LowestPriority { window });
     let remover = prop_oneof![Just(Remover::Fifo), lowest_priority];
-    ((2 * STEPS)..200, remover).prop_map(|(capacity, remover)| {
+    ((2 * STEPS)..120, remover).prop_map(|(capacity, remover)| {
         let sampler = match remover {
             Remover::Fifo => ItemSelector::Uniform,
             Remover::LowestPriority { .. } => ItemSelector::Prioritized { exponent: 0.7 },
@@ -132,6 +136,14 @@ impl Model {
         }
     }
 
+    /// The key of the first transition of one of the segments stored last, and how many it has.
+    fn recent(&self, index: Index) -> (u64, u64) {
+        let back = index.index(self.history.len().min(self.capacity / 3));
+        let place = self.history.len() - 1 - back;
+        let newer: u64 = self.history[place..].iter().map(|segment| segment.steps as u64).sum();
+        (self.transitions - newer, self.history[place].steps as u64)
+    }
+
     /// Whether the transition was there to get it.
     fn prioritize(&mut self, key: u64, priority: f32) -> bool {
         let of = |held: &&mut Held| (held.key..held.key + held.priorities.len() as u64).contains(&key);
@@ -209,15 +221,30 @@ fn check(store: &Store, model: &Model) -> Result<(), TestCaseError> {
     Ok(())
 }
 
+/// The log of a closed store holds the end of all that was stored, what could be sampled is in it, and it keeps at most a
+/// file more than it is to keep: a sixteenth of that, and the rest of a commit of so many transitions.
+fn check_log(dir: &Path, model: &Model, commit: usize) -> Result<(), TestCaseError> {
+    let logged: Vec<Segment> = segments(dir).unwrap().1.map(Result::unwrap).collect();
+    prop_assert!(model.history.ends_with(&logged));
+    let mut rest = logged.iter();
+    for Held { segment, .. } in &model.held {
+        prop_assert!(rest.any(|logged| logged == segment), "{:?} is not in the log", segment);
+    }
+    let (steps, kept): (usize, _) = (logged.iter().map(|segment| segment.steps).sum(), model.kept as usize);
+    prop_assert!(steps <= kept + kept.div_ceil(16) + commit, "{} transitions in the log", steps);
+    Ok(())
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(if std::env::var_os("GETUP_TEST_FULL").is_some() { 400 } else { 24 }))]
 
     #[test]
     fn a_store_is_what_a_plain_list_says(
-        actions in prop::collection::vec(action(), 1..60),
+        actions in prop::collection::vec(action(), 1..100),
         settings in settings(),
     ) {
         let dir = TempDir::new().unwrap();
+        let mut commit = COMMIT;
         let mut store = open(dir.path(), &spec(STEPS), &settings).unwrap();
         let (mut model, mut writers, mut sampler) = (Model::new(&settings), Writers::default(), Sampler::new(1));
         for action in actions {
@@ -242,9 +269,12 @@ proptest! {
                     }
                 }
                 Action::Prioritize(priorities) if model.transitions > 0 => {
-                    let back = |index: Index| index.index(model.transitions.min(2 * model.kept) as usize) as u64;
-                    let by_key = |(index, priority)| (model.transitions - 1 - back(index), priority);
-                    let priorities: Vec<(u64, f32)> = priorities.into_iter().map(by_key).collect();
+                    let mut by_key = Vec::new();
+                    for (index, priority) in priorities {
+                        let (key, steps) = model.recent(index);
+                        by_key.extend((key..key + steps).map(|key| (key, priority)));
+                    }
+                    let priorities = by_key;
                     let given = store.update_priorities(&priorities).unwrap();
                     if settings.remover == Remover::Fifo {
                         prop_assert_eq!(given, 0, "nothing has a priority");
@@ -256,12 +286,15 @@ proptest! {
                 Action::Prioritize(_) => {}
                 Action::Restart => {
                     drop(store);
+                    check_log(dir.path(), &model, commit)?;
                     model.restart();
                     store = open(dir.path(), &spec(STEPS), &settings).unwrap();
                 }
                 Action::Compact => {
                     drop(store);
+                    check_log(dir.path(), &model, commit)?;
                     compact(dir.path(), Some(model.kept)).unwrap();
+                    commit = COMPACTED;
                     model.restart();
                     store = open(dir.path(), &spec(STEPS), &settings).unwrap();
                 }
@@ -272,15 +305,6 @@ proptest! {
             prop_assert_eq!(store.introduce(writer, "actor"), sequence);
         }
         drop(store);
-        // The log holds the end of all that was stored, what can be sampled is in it, and it keeps at most a sixteenth more
-        // than it is to keep.
-        let logged: Vec<Segment> = segments(dir.path()).unwrap().1.map(Result::unwrap).collect();
-        prop_assert!(model.history.ends_with(&logged));
-        let mut rest = logged.iter();
-        for Held { segment, .. } in &model.held {
-            prop_assert!(rest.any(|logged| logged == segment), "{:?} is not in the log", segment);
-        }
-        let (steps, kept): (usize, _) = (logged.iter().map(|segment| segment.steps).sum(), model.kept as usize);
-        prop_assert!(steps <= kept + kept / 16 + 2 * 12 * STEPS, "{} transitions in the log", steps);
+        check_log(dir.path(), &model, commit)?;
     }
 }
