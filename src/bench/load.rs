@@ -41,6 +41,7 @@ pub(crate) fn episode(spec: &RunSpec, number: u64) -> Vec<Segment> {
                 reason: "time_limit".to_owned(),
                 tags: [].into(),
             }),
+            trace: None,
         }
     };
     (0..EPISODE).step_by(spec.max_segment_steps).map(cut).collect()
