@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use common::{Cluster, Process, free_address, http_get, metric, scrape, succeed, wait_for};
+use common::{Cluster, Process, free_address, getup, http_get, metric, scrape, succeed, wait_for};
 use serde_json::Value;
 
 const LIMIT: Duration = Duration::from_secs(60);
@@ -31,17 +31,31 @@ fn has_prometheus() -> bool {
     there
 }
 
-/// A fleet of four processes, and the Prometheus that scrapes it twice a second.
+/// A fleet of four processes, and the Prometheus that scrapes it twice a second. The second actor's way to the learner
+/// leads over a link.
 struct Fleet {
     cluster: Cluster,
     /// Of the second actor.
     second_metrics: String,
+    link: String,
     prometheus: String,
 }
 
 impl Fleet {
     fn new() -> Self {
-        Self { cluster: Cluster::new(), second_metrics: free_address(), prometheus: free_address() }
+        Self {
+            cluster: Cluster::new(),
+            second_metrics: free_address(),
+            link: free_address(),
+            prometheus: free_address(),
+        }
+    }
+
+    /// The link, with what is wrong with it.
+    fn link(&self, slowness: &[&str]) -> Process {
+        let mut command = getup(&["delay", "--by", "0"]);
+        command.args(slowness).arg(format!("{}={}", self.link, self.cluster.address("learner")));
+        Process::start("link", self.cluster.path(), &mut command)
     }
 
     fn actor(&self, index: usize) -> Process {
@@ -50,6 +64,7 @@ impl Fleet {
         command.args(["--name", name, "--log-format", "json"]);
         if index == 1 {
             command.args(["--set", &format!("network.actor_metrics={}", self.second_metrics)]);
+            command.args(["--set", &format!("network.learner={}", self.link)]);
         }
         Process::start(name, self.cluster.path(), &mut command)
     }
@@ -147,7 +162,8 @@ fn hurried(rules: &str) -> String {
         ("for: 15s", "for: 1s"),
         ("[30s]", "[3s]"),
         ("seconds > 60", "seconds > 4"),
-        ("seconds < 30", "seconds < 2"),
+        // Not a fifteenth: an actor waits five seconds for the answer to a heartbeat before it sends another.
+        ("seconds < 30", "seconds < 8"),
     ];
     let mut hurried = rules.to_owned();
     for (long, short) in times {
@@ -223,6 +239,7 @@ fn every_panel_has_an_answer_and_alerts_fire_under_their_faults_and_clear_after(
     let fleet = Fleet::new();
     let mut replay = fleet.replay(None);
     let mut learner = fleet.learner(&[]);
+    let link = fleet.link(&[]);
     let actors = [fleet.actor(0), fleet.actor(1)];
     let _prometheus = fleet.prometheus();
     fleet.wait_for_updates(20.0);
@@ -245,11 +262,29 @@ fn every_panel_has_an_answer_and_alerts_fire_under_their_faults_and_clear_after(
     // They move: so does what they count.
     let updates = "sum(rate(getup_learner_updates_total{run=~\"smoke\"}[3s]))";
     assert!(fleet.query(updates)[0] > 0.0);
-    for alert in
-        ["LearnerStalled", "LossNotFinite", "ActorLost", "EvaluationOverdue", "LimiterStuck", "TargetDown"]
-    {
+    for alert in [
+        "LearnerStalled",
+        "LossNotFinite",
+        "ActorLost",
+        "PolicyStale",
+        "EvaluationOverdue",
+        "LimiterStuck",
+        "TargetDown",
+    ] {
         assert!(!fleet.is_firing(alert), "{alert} fires in health");
     }
+
+    // A way to the actor that is too narrow for policies: its heartbeats are heard, what it plays grows old.
+    drop(link);
+    let link = fleet.link(&["--back", "500"]);
+    fleet.wait_until_firing("PolicyStale");
+    assert_eq!(
+        fleet.query("ALERTS{alertname=\"PolicyStale\", alertstate=\"firing\", actor!=\"actor-1\"}"),
+        Vec::<f64>::new()
+    );
+    drop(link);
+    let _link = fleet.link(&[]);
+    fleet.wait_until_clear("PolicyStale");
 
     // A replay that hangs: no metrics from it, no updates.
     replay.signal("STOP");
