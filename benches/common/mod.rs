@@ -35,6 +35,26 @@ pub(crate) struct Row {
     pub(crate) share_of_limit: Option<f64>,
 }
 
+impl Row {
+    /// A row without a peer and without a limit.
+    pub(crate) fn plain(name: String, unit: &str, ours: f64) -> Self {
+        Self {
+            name,
+            unit: unit.to_owned(),
+            ours,
+            peer: None,
+            limit: None,
+            ratio_to_peer: None,
+            share_of_limit: None,
+        }
+    }
+
+    /// Such a row, of which less is better.
+    pub(crate) fn less(name: String, unit: &str, ours: f64) -> Self {
+        Self::plain(name, &format!("{unit} (less is better)"), ours)
+    }
+}
+
 /// Prints the rows as a table and writes them to `target/bench/NAME.json`.
 pub(crate) fn report(name: &str, rows: &[Row]) -> anyhow::Result<()> {
     let number = |value: Option<f64>, decimals: usize| {

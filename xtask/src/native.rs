@@ -35,7 +35,7 @@ pub(crate) const CUDA_WHEELS: &[&str] = &[
 ];
 /// What benchmarks compare with: PyTorch whole, with NumPy for its tensors.
 const PEER_REQUIREMENTS: &[&str] = &["torch==2.11.0", "numpy==2.3.5"];
-/// What `benches/replay.rs` compares with, in an environment of its own: it needs an older NumPy.
+/// What `benches/replay/` compares with, in an environment of its own: it needs an older NumPy.
 const REVERB_REQUIREMENTS: &[&str] =
     &["dm-reverb[tensorflow]==0.14.0", "tensorflow==2.15.1", "numpy==1.26.4"];
 /// What tests read exported stores with, and what they check `deploy/` against: the schemas of Compose, Grafana (for

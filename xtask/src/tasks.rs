@@ -93,7 +93,7 @@ pub(crate) fn check() -> Result<()> {
         .env("RUSTDOCFLAGS", "-D warnings"))
 }
 
-/// Runs `benches/NAME.rs`, which prints its table and writes `target/bench/NAME.json`.
+/// Runs the benchmark NAME of `benches/`, which prints its table and writes `target/bench/NAME.json`.
 pub(crate) fn bench(name: &str) -> Result<()> {
     let folder = root().join("benches");
     if !folder.join(format!("{name}.rs")).is_file() {
