@@ -238,7 +238,6 @@ impl Bench {
     /// Minibatches a second.
     async fn sample(&self, batch: usize) -> Result<f64> {
         let options = RemoteOptions {
-            endpoint: Endpoint::default(),
             spec: self.spec.clone(),
             sample: SampleOptions {
                 batch,

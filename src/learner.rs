@@ -78,7 +78,6 @@ async fn serve(
     let server = tokio::spawn(serve_grpc(port, routes, listener, role.shutdown.clone()));
     role.ready.set();
     let options = RemoteOptions {
-        endpoint: Endpoint::default(),
         spec: config.run_spec()?,
         sample: sample_options(config, incarnation),
         name: "learner".into(),

@@ -14,7 +14,7 @@ use getup_policy::{Body, ObservationStatistics, Policy, PolicyShape};
 use getup_proto::{PolicyVersion, v1};
 use getup_replay::{MinibatchSource, RemoteOptions, SampleError, SampleOptions, ShardedSource};
 use getup_telemetry::{Registry, Shutdown, Waits, health};
-use getup_transport::{Endpoint, Limits, Window};
+use getup_transport::{Limits, Window};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde_json::json;
@@ -97,7 +97,6 @@ fn publish(hub: &Hub, per_second: f64, shutdown: &Shutdown) {
 
 fn source(replay: &str, shutdown: &Shutdown) -> ShardedSource {
     let options = RemoteOptions {
-        endpoint: Endpoint::default(),
         spec: get_up_spec(),
         sample: SampleOptions { batch: BATCH, n_step: 5, gamma: 0.97, seed: 1, segments: false },
         name: "learner".to_owned(),

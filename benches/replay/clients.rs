@@ -95,7 +95,6 @@ pub(crate) fn sample(
     batch: usize,
 ) -> Result<(f64, [f64; 2])> {
     let options = RemoteOptions {
-        endpoint: endpoint.into(),
         spec: spec.clone(),
         sample: SampleOptions { batch, n_step: 1, gamma: 0.97, seed: 1, segments: false },
         name: "benchmark".to_owned(),
@@ -103,7 +102,7 @@ pub(crate) fn sample(
         prefetch: PREFETCH,
     };
     let mut source =
-        RemoteSource::new(options, runtime.handle(), Waits::new(&Registry::new()), Shutdown::new());
+        RemoteSource::new(endpoint, options, runtime.handle(), Waits::new(&Registry::new()), Shutdown::new());
     source.next()?;
     let mut moments = vec![Instant::now()];
     while moments[0].elapsed() < TURN {

@@ -134,7 +134,6 @@ fn the_toy_task_is_learned_from_a_prioritized_table_over_grpc() {
     let shutdown = Shutdown::new();
     let serving = runtime.spawn(serve(listener, store(&dir), shutdown.clone()));
     let remote = RemoteOptions {
-        endpoint: (&endpoint).into(),
         spec: spec(),
         sample: options(),
         name: "learner".to_owned(),
@@ -142,7 +141,7 @@ fn the_toy_task_is_learned_from_a_prioritized_table_over_grpc() {
         prefetch: 8,
     };
     let waits = Waits::new(&Registry::new());
-    learns(RemoteSource::new(remote, runtime.handle(), waits, shutdown.clone()));
+    learns(RemoteSource::new(&endpoint, remote, runtime.handle(), waits, shutdown.clone()));
     shutdown.trigger();
     runtime.block_on(serving).unwrap().unwrap();
 }

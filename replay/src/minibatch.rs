@@ -135,6 +135,17 @@ pub enum OptionsError {
     Gamma(f32),
 }
 
+impl OptionsError {
+    /// Whether all of these can be priorities of the transitions whose keys stand before them.
+    ///
+    /// # Errors
+    /// [`OptionsError::Priority`] with the first that is negative or not finite.
+    pub(crate) fn check_priorities(priorities: &[(u64, f32)]) -> Result<(), Self> {
+        let wrong = priorities.iter().find(|(_, priority)| !(priority.is_finite() && *priority >= 0.0));
+        wrong.map_or(Ok(()), |&(key, priority)| Err(Self::Priority { key, priority }))
+    }
+}
+
 /// The most steps a transition may span.
 pub const MAX_N_STEP: usize = 1024;
 

@@ -44,7 +44,7 @@ struct Shard {
 }
 
 impl ShardedSource {
-    /// Samples `endpoints`, each with `options` for the rest.
+    /// Samples the services at `endpoints`, each with `options`.
     ///
     /// # Panics
     /// If there are no endpoints.
@@ -58,11 +58,12 @@ impl ShardedSource {
         assert!(!endpoints.is_empty(), "a source samples somewhere");
         let arrivals = Bell::default();
         let shard = |(index, endpoint): (usize, &Endpoint)| {
-            let mut options = RemoteOptions { endpoint: endpoint.clone(), ..options.clone() };
+            let mut options = options.clone();
             // No two draw alike.
             options.sample.seed = options.sample.seed.wrapping_add((index as u64) << 48);
             let (waits, shutdown) = (waits.clone(), shutdown.clone());
-            let source = RemoteSource::with_bell(options, runtime, waits, shutdown, Some(arrivals.clone()));
+            let (endpoint, bell) = (endpoint.clone(), Some(arrivals.clone()));
+            let source = RemoteSource::with_bell(endpoint, options, runtime, waits, shutdown, bell);
             Shard { source, next: None, held: 1.0, turn: 0.0, late: true }
         };
         let shards = endpoints.iter().enumerate().map(shard).collect();

@@ -118,14 +118,19 @@ fn a_full_disk_does_not_hold_up_the_end_and_keeps_what_was_acknowledged() {
 
 fn source(replay: &Replay, batch: usize) -> RemoteSource {
     let options = RemoteOptions {
-        endpoint: (&replay.endpoint).into(),
         spec: replay.spec.clone(),
         sample: options(batch),
         name: "learner".to_owned(),
         table: String::new(),
         prefetch: 4,
     };
-    RemoteSource::new(options, replay.runtime.handle(), replay.waits.clone(), replay.shutdown.clone())
+    RemoteSource::new(
+        &replay.endpoint,
+        options,
+        replay.runtime.handle(),
+        replay.waits.clone(),
+        replay.shutdown.clone(),
+    )
 }
 
 #[test]

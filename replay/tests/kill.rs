@@ -192,12 +192,11 @@ fn a_slow_disk_holds_up_writers_and_not_samplers_and_loses_nothing() {
 
 fn sampler(endpoint: &str, runtime: &tokio::runtime::Runtime) -> RemoteSource {
     let options = RemoteOptions {
-        endpoint: endpoint.into(),
         spec: spec(STEPS),
         sample: common::options(32),
         name: "learner".to_owned(),
         table: String::new(),
         prefetch: 2,
     };
-    RemoteSource::new(options, runtime.handle(), Waits::new(&Registry::new()), Shutdown::new())
+    RemoteSource::new(endpoint, options, runtime.handle(), Waits::new(&Registry::new()), Shutdown::new())
 }

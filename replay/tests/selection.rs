@@ -77,14 +77,19 @@ fn waiting(replay: &Replay) -> String {
 
 fn source(replay: &Replay, batch: usize) -> RemoteSource {
     let options = RemoteOptions {
-        endpoint: (&replay.endpoint).into(),
         spec: replay.spec.clone(),
         sample: options(batch),
         name: "learner".to_owned(),
         table: String::new(),
         prefetch: 2,
     };
-    RemoteSource::new(options, replay.runtime.handle(), replay.waits.clone(), replay.shutdown.clone())
+    RemoteSource::new(
+        &replay.endpoint,
+        options,
+        replay.runtime.handle(),
+        replay.waits.clone(),
+        replay.shutdown.clone(),
+    )
 }
 
 #[test]
@@ -233,7 +238,6 @@ fn tables_of_one_service_know_nothing_of_each_other() {
     let described = runtime.block_on(describe_table(&endpoint, "queue")).unwrap();
     assert_eq!((described.size, described.tables), (64, vec!["default".to_owned(), "queue".to_owned()]));
     let options = RemoteOptions {
-        endpoint: (&endpoint).into(),
         spec: get_up_spec(),
         sample: options(32),
         name: "learner".to_owned(),
@@ -241,7 +245,7 @@ fn tables_of_one_service_know_nothing_of_each_other() {
         prefetch: 2,
     };
     let waits = Waits::new(&Registry::new());
-    let mut source = RemoteSource::new(options, runtime.handle(), waits, shutdown.clone());
+    let mut source = RemoteSource::new(&endpoint, options, runtime.handle(), waits, shutdown.clone());
     let taken: Vec<u64> = (0..2).flat_map(|_| source.next().unwrap().items).map(|item| item.key).collect();
     assert_eq!(taken, (0..64).collect::<Vec<_>>());
     assert!(source.poll(Duration::from_millis(50)).unwrap().is_none());

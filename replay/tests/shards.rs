@@ -30,7 +30,6 @@ struct Learner {
 fn learner(replays: &[&Replay]) -> Learner {
     let endpoints: Vec<Endpoint> = replays.iter().map(|replay| (&replay.endpoint).into()).collect();
     let options = RemoteOptions {
-        endpoint: Endpoint::default(),
         table: String::new(),
         spec: spec(STEPS),
         sample: options(16),

@@ -25,7 +25,6 @@ fn local(replay: &Replay, options: SampleOptions) -> Result<Box<dyn MinibatchSou
 
 fn remote(replay: &Replay, sample: SampleOptions) -> Result<Box<dyn MinibatchSource>, SampleError> {
     let options = RemoteOptions {
-        endpoint: (&replay.endpoint).into(),
         spec: replay.spec.clone(),
         sample,
         name: "learner".to_owned(),
@@ -33,7 +32,8 @@ fn remote(replay: &Replay, sample: SampleOptions) -> Result<Box<dyn MinibatchSou
         prefetch: 4,
     };
     let runtime = replay.runtime.handle();
-    let source = RemoteSource::new(options, runtime, replay.waits.clone(), replay.shutdown.clone());
+    let source =
+        RemoteSource::new(&replay.endpoint, options, runtime, replay.waits.clone(), replay.shutdown.clone());
     Ok(Box::new(source))
 }
 
@@ -258,14 +258,13 @@ fn a_remote_source_waits_for_the_service_and_comes_back_after_its_restart_with_o
     let endpoint = bind("127.0.0.1:0").local_addr().unwrap().to_string();
 
     let options = RemoteOptions {
-        endpoint: (&endpoint).into(),
         spec: spec(8),
         sample: options(32),
         name: "learner".to_owned(),
         table: String::new(),
         prefetch: 1,
     };
-    let mut source = RemoteSource::new(options, runtime.handle(), waits.clone(), shutdown);
+    let mut source = RemoteSource::new(&endpoint, options, runtime.handle(), waits.clone(), shutdown);
     assert!(source.poll(Duration::from_millis(200)).unwrap().is_none());
     let mut drawn: Vec<Minibatch> = Vec::new();
     for _ in 0..3 {

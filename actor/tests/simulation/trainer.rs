@@ -65,7 +65,6 @@ impl Trainer {
     ) -> turmoil::Result<Self> {
         let source = |index: usize| {
             let options = RemoteOptions {
-                endpoint: endpoint(&replay_name(index), machine),
                 table: String::new(),
                 spec: spec(),
                 sample: SampleOptions {
@@ -78,7 +77,13 @@ impl Trainer {
                 name: machine.name.clone(),
                 prefetch: 4,
             };
-            RemoteSource::new(options, &Handle::current(), waits.clone(), shutdown.clone())
+            RemoteSource::new(
+                endpoint(&replay_name(index), machine),
+                options,
+                &Handle::current(),
+                waits.clone(),
+                shutdown.clone(),
+            )
         };
         let sources = (0..run.replays).map(source).collect();
         let shape = PolicyShape { observation: 2, action: 1, body: Body::Mlp { hidden: vec![2] } };

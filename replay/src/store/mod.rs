@@ -4,26 +4,27 @@
 //! limiter counts it. Only then does [`Store::append`] return, which is the acknowledgement. Sampling takes the
 //! limiter's leave, then reads the ring. Neither holds up the other but for the moment of a copy.
 
-use crate::config::ReplayConfig;
-use crate::error::StoreError;
-use crate::gate::{Gate, Peer};
-use crate::gather::{gather, gather_segments};
-use crate::limiter::Limiter;
-use crate::log::{self, Log, State, Watermark};
-use crate::metrics::ReplayMetrics;
-use crate::minibatch::{
-    Item, MAX_N_STEP, Minibatch, MinibatchColumn, OptionsError, ReplayCounters, SampleOptions, SampledSegment,
-};
-use crate::ring::{Drawn, Ring};
-use crate::sampler::Sampler;
-use crate::undrawn::{Followed, Undrawn};
-use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment, SegmentTrace, TraceContext, columns, v1};
-use getup_telemetry::traces::{KeyValue, SpanKind};
-use getup_telemetry::{Shutdown, Traces, Waits};
+mod following;
+mod sampling;
+
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
+
+use following::arrived;
+use getup_proto::{RunSpec, Segment, v1};
+use getup_telemetry::{Shutdown, Traces, Waits};
+
+use crate::config::ReplayConfig;
+use crate::error::StoreError;
+use crate::gate::{Gate, Peer};
+use crate::limiter::Limiter;
+use crate::log::{self, Log, State, Watermark};
+use crate::metrics::ReplayMetrics;
+use crate::minibatch::ReplayCounters;
+use crate::ring::Ring;
+use crate::undrawn::Undrawn;
 
 /// How often a full disk is tried again.
 const FULL_TICK: Duration = Duration::from_millis(250);
@@ -296,125 +297,6 @@ impl Store {
         &self.dir
     }
 
-    /// Whether minibatches of this kind can be sampled from this store.
-    ///
-    /// # Errors
-    /// [`OptionsError`] with the first option that is out of range.
-    pub fn check_options(&self, options: &SampleOptions) -> Result<(), OptionsError> {
-        let &SampleOptions { batch, n_step, gamma, .. } = options;
-        // At most two rows of every column, or the longest segment's, and a few numbers.
-        let widths: usize = self.spec.columns.iter().map(|column| column.width).sum();
-        let rows = if options.segments { self.spec.max_segment_steps + 1 } else { 2 };
-        let max = MAX_MESSAGE_BYTES / 2 / ((rows * widths + 2) * columns::VALUE_BYTES);
-        if !(1..=max).contains(&batch) {
-            return Err(OptionsError::Batch { batch, max });
-        }
-        let most =
-            self.max_times_sampled.map_or(usize::MAX, |times| self.capacity.saturating_mul(times as usize));
-        if batch > most {
-            return Err(OptionsError::Batch { batch, max: most });
-        }
-        let error_buffer = self.gate.limiter().largest_sample();
-        if batch as f64 > error_buffer {
-            return Err(OptionsError::Buffer { batch, error_buffer });
-        }
-        if !(1..=MAX_N_STEP).contains(&n_step) {
-            return Err(OptionsError::NStep(n_step));
-        }
-        if !(0.0..=1.0).contains(&gamma) {
-            return Err(OptionsError::Gamma(gamma));
-        }
-        Ok(())
-    }
-
-    /// A minibatch, if the limiter lets one out now.
-    ///
-    /// # Errors
-    /// [`StoreError::Io`] if the sample cannot be counted.
-    pub fn try_sample(
-        &self,
-        sampler: &mut Sampler,
-        options: &SampleOptions,
-    ) -> Result<Option<Minibatch>, StoreError> {
-        let started = Instant::now();
-        let began = self.traces.is_on().then(SystemTime::now);
-        let mut sampled = 0;
-        let count = |total| {
-            sampled = total;
-            self.watermark.set_sampled(total)
-        };
-        let (found, items, followed, state, held) = if self.selects {
-            let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
-            if !self.gate.try_sample(options.batch as u64, count)? {
-                return Ok(None);
-            }
-            let drawn = sampler.draw(&mut memory.ring, options.batch);
-            self.gate.set_available(memory.ring.available());
-            let ring = &memory.ring;
-            let item =
-                |drawn: &Drawn| Item { key: ring.key(drawn.slot), probability: drawn.probability as f32 };
-            let items = drawn.iter().map(item).collect();
-            (found(ring, &drawn, options), items, self.followed(ring, &drawn), memory.state, ring.len())
-        } else {
-            if !self.gate.try_sample(options.batch as u64, count)? {
-                return Ok(None);
-            }
-            let memory = self.memory();
-            let drawn = sampler.draw_uniformly(&memory.ring, options.batch);
-            let found = found(&memory.ring, &drawn, options);
-            (found, Vec::new(), self.followed(&memory.ring, &drawn), memory.state, memory.ring.len())
-        };
-        let counters = self.counters_of(state, sampled, held);
-        self.metrics.sampled.inc_by(options.batch as u64);
-        self.metrics.sample_seconds.observe(started.elapsed().as_secs_f64());
-        self.show_limiter();
-        let (columns, segments) = found;
-        let sampled = |followed: Followed| self.sampled(&followed, began, options.batch);
-        let traces = followed.into_iter().map(sampled).collect();
-        Ok(Some(Minibatch { columns, items, segments, counters, traces }))
-    }
-
-    /// Records what befell a segment that is followed up to now, when it has entered the ring as the newest.
-    fn committed(&self, ring: &Ring, segment: &Segment, trace: SegmentTrace) {
-        let now = SystemTime::now();
-        let SegmentTrace { context, begun, since } = trace;
-        self.traces.child(context, ("limiter", SpanKind::Internal), begun, since, Vec::new());
-        let sequence = KeyValue::new("getup.sequence", segment.sequence as i64);
-        self.traces.child(context, ("commit", SpanKind::Consumer), since, now, vec![sequence]);
-        self.undrawn.insert(ring.numbers(), context, now);
-    }
-
-    /// The segments that are followed of which one of `drawn` is the first draw.
-    fn followed(&self, ring: &Ring, drawn: &[Drawn]) -> Vec<Followed> {
-        self.undrawn.take(drawn.iter().map(|drawn| ring.number_of(drawn.slot)))
-    }
-
-    /// Records that a segment that is followed is in a minibatch for the first time; returns where its trace goes on.
-    fn sampled(&self, followed: &Followed, began: Option<SystemTime>, batch: usize) -> TraceContext {
-        let &Followed { context, since, .. } = followed;
-        let from = began.map_or(since, |began| began.max(since));
-        let waited = from.duration_since(since).unwrap_or_default().as_secs_f64();
-        let attributes =
-            vec![KeyValue::new("getup.batch", batch as i64), KeyValue::new("getup.undrawn_seconds", waited)];
-        self.traces.child(context, ("sample", SpanKind::Producer), from, SystemTime::now(), attributes)
-    }
-
-    /// Gives transitions priorities, by their keys; returns how many were there to get them. A priority of 0 is the
-    /// least there is, and does not remove a transition.
-    ///
-    /// # Errors
-    /// [`OptionsError::Priority`] with the first that is negative or not finite: then none is given.
-    pub fn update_priorities(&self, priorities: &[(u64, f32)]) -> Result<u64, OptionsError> {
-        if let Some(&(key, priority)) =
-            priorities.iter().find(|(_, priority)| !(priority.is_finite() && *priority >= 0.0))
-        {
-            return Err(OptionsError::Priority { key, priority });
-        }
-        let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
-        let given = priorities.iter().filter(|&&(key, priority)| memory.ring.set_priority(key, priority));
-        Ok(given.count() as u64)
-    }
-
     /// Totals over the store's life.
     pub fn counters(&self) -> ReplayCounters {
         let (state, held) = {
@@ -490,25 +372,5 @@ impl Store {
 
     fn memory(&self) -> RwLockReadGuard<'_, Memory> {
         self.memory.read().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-/// Those of the segments that are followed are here now, whatever befell them in this process before.
-fn arrived(segments: &mut [Segment]) {
-    for trace in segments.iter_mut().filter_map(|segment| segment.trace.as_mut()) {
-        **trace = SegmentTrace::arrived(trace.context);
-    }
-}
-
-/// The columns of what was drawn; of whole segments also what they are.
-fn found(
-    ring: &Ring,
-    drawn: &[Drawn],
-    options: &SampleOptions,
-) -> (Vec<MinibatchColumn>, Vec<SampledSegment>) {
-    if options.segments {
-        (gather_segments(ring, drawn), drawn.iter().map(|drawn| ring.segment_of(drawn.slot)).collect())
-    } else {
-        (gather(ring, drawn, options), Vec::new())
     }
 }

@@ -1,0 +1,121 @@
+//! What is drawn from a [`Store`], and how often what.
+
+use std::sync::PoisonError;
+use std::time::{Instant, SystemTime};
+
+use getup_proto::{MAX_MESSAGE_BYTES, columns};
+
+use super::Store;
+use crate::error::StoreError;
+use crate::gather::{gather, gather_segments};
+use crate::minibatch::{
+    Item, MAX_N_STEP, Minibatch, MinibatchColumn, OptionsError, SampleOptions, SampledSegment,
+};
+use crate::ring::{Drawn, Ring};
+use crate::sampler::Sampler;
+use crate::undrawn::Followed;
+
+impl Store {
+    /// Whether minibatches of this kind can be sampled from this store.
+    ///
+    /// # Errors
+    /// [`OptionsError`] with the first option that is out of range.
+    pub fn check_options(&self, options: &SampleOptions) -> Result<(), OptionsError> {
+        let &SampleOptions { batch, n_step, gamma, .. } = options;
+        // At most two rows of every column, or the longest segment's, and a few numbers.
+        let widths: usize = self.spec.columns.iter().map(|column| column.width).sum();
+        let rows = if options.segments { self.spec.max_segment_steps + 1 } else { 2 };
+        let max = MAX_MESSAGE_BYTES / 2 / ((rows * widths + 2) * columns::VALUE_BYTES);
+        if !(1..=max).contains(&batch) {
+            return Err(OptionsError::Batch { batch, max });
+        }
+        let most =
+            self.max_times_sampled.map_or(usize::MAX, |times| self.capacity.saturating_mul(times as usize));
+        if batch > most {
+            return Err(OptionsError::Batch { batch, max: most });
+        }
+        let error_buffer = self.gate.limiter().largest_sample();
+        if batch as f64 > error_buffer {
+            return Err(OptionsError::Buffer { batch, error_buffer });
+        }
+        if !(1..=MAX_N_STEP).contains(&n_step) {
+            return Err(OptionsError::NStep(n_step));
+        }
+        if !(0.0..=1.0).contains(&gamma) {
+            return Err(OptionsError::Gamma(gamma));
+        }
+        Ok(())
+    }
+
+    /// A minibatch, if the limiter lets one out now.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`] if the sample cannot be counted.
+    pub fn try_sample(
+        &self,
+        sampler: &mut Sampler,
+        options: &SampleOptions,
+    ) -> Result<Option<Minibatch>, StoreError> {
+        let started = Instant::now();
+        let began = self.traces.is_on().then(SystemTime::now);
+        let mut sampled = 0;
+        let count = |total| {
+            sampled = total;
+            self.watermark.set_sampled(total)
+        };
+        let (found, items, followed, state, held) = if self.selects {
+            let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
+            if !self.gate.try_sample(options.batch as u64, count)? {
+                return Ok(None);
+            }
+            let drawn = sampler.draw(&mut memory.ring, options.batch);
+            self.gate.set_available(memory.ring.available());
+            let ring = &memory.ring;
+            let item =
+                |drawn: &Drawn| Item { key: ring.key(drawn.slot), probability: drawn.probability as f32 };
+            let items = drawn.iter().map(item).collect();
+            (found(ring, &drawn, options), items, self.followed(ring, &drawn), memory.state, ring.len())
+        } else {
+            if !self.gate.try_sample(options.batch as u64, count)? {
+                return Ok(None);
+            }
+            let memory = self.memory();
+            let drawn = sampler.draw_uniformly(&memory.ring, options.batch);
+            let found = found(&memory.ring, &drawn, options);
+            (found, Vec::new(), self.followed(&memory.ring, &drawn), memory.state, memory.ring.len())
+        };
+        let counters = self.counters_of(state, sampled, held);
+        self.metrics.sampled.inc_by(options.batch as u64);
+        self.metrics.sample_seconds.observe(started.elapsed().as_secs_f64());
+        self.show_limiter();
+        let (columns, segments) = found;
+        let sampled = |followed: Followed| self.sampled(&followed, began, options.batch);
+        let traces = followed.into_iter().map(sampled).collect();
+        Ok(Some(Minibatch { columns, items, segments, counters, traces }))
+    }
+
+    /// Gives transitions priorities, by their keys; returns how many were there to get them. A priority of 0 is the
+    /// least there is, and does not remove a transition.
+    ///
+    /// # Errors
+    /// [`OptionsError::Priority`] with the first that is negative or not finite: then none is given.
+    pub fn update_priorities(&self, priorities: &[(u64, f32)]) -> Result<u64, OptionsError> {
+        OptionsError::check_priorities(priorities)?;
+        let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
+        let given = priorities.iter().filter(|&&(key, priority)| memory.ring.set_priority(key, priority));
+        Ok(given.count() as u64)
+    }
+}
+
+/// The columns of what was drawn; of whole segments also what they are.
+fn found(
+    ring: &Ring,
+    drawn: &[Drawn],
+    options: &SampleOptions,
+) -> (Vec<MinibatchColumn>, Vec<SampledSegment>) {
+    if options.segments {
+        (gather_segments(ring, drawn), drawn.iter().map(|drawn| ring.segment_of(drawn.slot)).collect())
+    } else {
+        (gather(ring, drawn, options), Vec::new())
+    }
+}
