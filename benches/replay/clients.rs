@@ -3,7 +3,7 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use getup_actor::link::SegmentWriter;
 use getup_actor::{GrpcReplay, Identity};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment, v1};
@@ -11,9 +11,10 @@ use getup_replay::{MinibatchSource, RemoteOptions, RemoteSource, SampleOptions, 
 use getup_telemetry::{Registry, Shutdown, Waits};
 use tokio::runtime::Runtime;
 
-use crate::fixtures::{self, Ending, Part};
+use crate::fixtures::get_up_spec;
+use crate::load::{episode, percentiles};
 use crate::services::Service;
-use crate::{EPISODE, PREFETCH, STEPS, TURN};
+use crate::{PREFETCH, TURN};
 
 /// Segments that an actor appends at once.
 const APPEND: usize = 16;
@@ -38,23 +39,22 @@ pub(crate) fn insert(runtime: &Runtime, writers: u64, sync: &str) -> Result<(f64
         Ok::<_, anyhow::Error>((transitions as f64 / started.elapsed().as_secs_f64(), transitions, times))
     };
     let (rate, written, _) = work(APPEND)?;
-    let (_, more, mut times) = work(1)?;
+    let (_, more, times) = work(1)?;
     let described = runtime.block_on(describe(&service.endpoint)).map_err(anyhow::Error::from)?;
     let stored = described.counters.unwrap_or_default().transitions;
     ensure!(stored == (written + more) as u64, "{stored} of {} transitions are stored", written + more);
-    times.sort_by(f64::total_cmp);
-    Ok((rate, [0.5, 0.99].map(|share| times[((times.len() - 1) as f64 * share) as usize])))
+    Ok((rate, p50_and_p99(times)?))
 }
 
 /// Appends for a turn, so many segments at a time; returns the transitions and how long each append took.
 async fn write(endpoint: String, writer: u64, at_once: usize) -> Result<(usize, Vec<f64>)> {
     // The segments of several episodes, again and again: only their numbers differ.
-    let mut segments: Vec<Segment> = (0..8).flat_map(|n| episode(writer, n)).collect();
+    let mut segments: Vec<Segment> = (0..8).flat_map(|number| episode(&get_up_spec(), number)).collect();
     let identity =
         Identity { name: format!("writer {writer}"), run_seed: 0, writer: writer + 1000 * at_once as u64 };
     let id = identity.writer;
     let waits = Waits::new(&Registry::new());
-    let mut link = GrpcReplay::new(&endpoint, fixtures::get_up_spec(), identity, waits)?;
+    let mut link = GrpcReplay::new(&endpoint, get_up_spec(), identity, waits)?;
     let (mut transitions, mut times, mut sequence) = (0, Vec::new(), 0);
     let started = Instant::now();
     'turn: loop {
@@ -73,18 +73,6 @@ async fn write(endpoint: String, writer: u64, at_once: usize) -> Result<(usize, 
         }
     }
     Ok((transitions, times))
-}
-
-/// An episode of 250 steps, cut.
-pub(crate) fn episode(writer: u64, number: u64) -> Vec<Segment> {
-    let spec = fixtures::get_up_spec();
-    let cut = |first_step: usize| {
-        let steps = STEPS.min(EPISODE - first_step);
-        let ending = if first_step + steps == EPISODE { Ending::Truncated } else { Ending::None };
-        Part { writer, sequence: 1, lane: 0, episode: number, first_step: first_step as u32, steps, ending }
-            .build(&spec)
-    };
-    (0..EPISODE).step_by(STEPS).map(cut).collect()
 }
 
 /// Transitions sampled a second, and p50 and p99 of the seconds between minibatches.
@@ -109,10 +97,9 @@ pub(crate) fn sample(
         black_box(source.next()?);
         moments.push(Instant::now());
     }
-    let mut times: Vec<f64> = moments.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64()).collect();
+    let times: Vec<f64> = moments.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64()).collect();
     let rate = (times.len() * batch) as f64 / times.iter().sum::<f64>();
-    times.sort_by(f64::total_cmp);
-    Ok((rate, [0.5, 0.99].map(|share| times[((times.len() - 1) as f64 * share) as usize])))
+    Ok((rate, p50_and_p99(times)?))
 }
 
 /// Transitions a second of the bare stream.
@@ -135,4 +122,9 @@ pub(crate) fn drain(runtime: &Runtime, endpoint: &str, batch: usize) -> Result<f
         }
         Ok(transitions as f64 / started.elapsed().as_secs_f64())
     })
+}
+
+fn p50_and_p99(times: Vec<f64>) -> Result<[f64; 2]> {
+    let [Some(p50), Some(p99)] = percentiles(times, [0.5, 0.99]) else { bail!("nothing came in {TURN:?}") };
+    Ok([p50, p99])
 }

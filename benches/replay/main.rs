@@ -23,6 +23,8 @@ mod clients;
 mod common;
 #[path = "../../replay/tests/fixtures/mod.rs"]
 mod fixtures;
+#[path = "../../src/bench/load.rs"]
+mod load;
 mod reverb;
 mod rows;
 mod services;
@@ -39,8 +41,6 @@ use tokio::runtime::Runtime;
 const TURN: Duration = Duration::from_secs(4);
 /// Transitions of a full store.
 const FULL: usize = 1_000_000;
-const STEPS: usize = 64;
-const EPISODE: usize = 250;
 /// Minibatches that are fetched ahead.
 const PREFETCH: usize = 16;
 

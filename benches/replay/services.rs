@@ -12,8 +12,9 @@ use getup_telemetry::{Registry, Shutdown, Waits};
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 
-use crate::clients::episode;
-use crate::{FULL, fixtures};
+use crate::FULL;
+use crate::fixtures::get_up_spec;
+use crate::load::episode;
 
 fn config(sync: SyncMode) -> ReplayConfig {
     ReplayConfig { capacity: FULL, min_size: 1, sync, ..ReplayConfig::default() }
@@ -22,13 +23,13 @@ fn config(sync: SyncMode) -> ReplayConfig {
 pub(crate) fn open(dir: &Path, sync: SyncMode) -> Result<Store> {
     let registry = Registry::new();
     let (metrics, waits) = (ReplayMetrics::new(&registry), Waits::new(&registry));
-    Ok(Store::open(dir, &fixtures::get_up_spec(), &config(sync), metrics, waits)?)
+    Ok(Store::open(dir, &get_up_spec(), &config(sync), metrics, waits)?)
 }
 
 /// A store of a million transitions.
 pub(crate) fn fill(dir: &Path) -> Result<()> {
     let store = open(dir, SyncMode::Process)?;
-    let mut segments: Vec<Segment> = (0..16).flat_map(|n| episode(1, n)).collect();
+    let mut segments: Vec<Segment> = (0..16).flat_map(|number| episode(&get_up_spec(), number)).collect();
     let mut sequence = 0;
     while store.counters().transitions < FULL as u64 + 1000 {
         for segment in &mut segments {

@@ -6,7 +6,7 @@ mod fixtures;
 use common::{PATIENCE, Replay, Writer, config, eventually, hello, open, options};
 use fixtures::{get_up_spec, segment, spec};
 use getup_proto::v1;
-use getup_replay::{MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, Survey, describe};
+use getup_replay::{MinibatchSource, ReplayConfig, Survey, describe};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -68,7 +68,7 @@ fn a_full_disk_holds_writers_up_and_loses_nothing() {
     let stored = replay.store.counters().transitions;
     assert!((64 * 60..64 * 200).contains(&stored), "{stored}");
     // Whoever samples notices nothing.
-    let mut source = source(&replay, 32);
+    let mut source = replay.source(options(32), 4);
     for _ in 0..20 {
         source.next().unwrap();
     }
@@ -116,23 +116,6 @@ fn a_full_disk_does_not_hold_up_the_end_and_keeps_what_was_acknowledged() {
     assert!(survey.segments >= durable);
 }
 
-fn source(replay: &Replay, batch: usize) -> RemoteSource {
-    let options = RemoteOptions {
-        spec: replay.spec.clone(),
-        sample: options(batch),
-        name: "learner".to_owned(),
-        table: String::new(),
-        prefetch: 4,
-    };
-    RemoteSource::new(
-        &replay.endpoint,
-        options,
-        replay.runtime.handle(),
-        replay.waits.clone(),
-        replay.shutdown.clone(),
-    )
-}
-
 #[test]
 fn a_client_that_stops_reading_delays_nobody_and_costs_no_memory() {
     let replay = Replay::start(get_up_spec(), &config());
@@ -163,7 +146,7 @@ fn a_client_that_stops_reading_delays_nobody_and_costs_no_memory() {
     });
     // What waits for it is some messages of 4 MB; a minibatch has 164 KB.
     assert!(sampled() / 256 < 400, "{} minibatches wait for it", sampled() / 256);
-    let mut source = source(&replay, 64);
+    let mut source = replay.source(options(64), 4);
     for _ in 0..50 {
         source.next().unwrap();
     }

@@ -58,7 +58,7 @@ fn a_queue_hands_out_each_transition_once_in_order_and_waits_on_both_sides() {
     });
     eventually("the writer waits", || waiting(&replay).starts_with("writer waits"));
     eventually("what came before is durable", || replay.store.counters().env_steps == 64);
-    let mut source = source(&replay, 16);
+    let mut source = replay.source(options(16), 2);
     let mut taken = Vec::new();
     for _ in 0..25 {
         taken.extend(origins(&source.next().unwrap()));
@@ -73,23 +73,6 @@ fn a_queue_hands_out_each_transition_once_in_order_and_waits_on_both_sides() {
 
 fn waiting(replay: &Replay) -> String {
     replay.runtime.block_on(describe(&replay.endpoint)).unwrap().limiter.unwrap().waiting
-}
-
-fn source(replay: &Replay, batch: usize) -> RemoteSource {
-    let options = RemoteOptions {
-        spec: replay.spec.clone(),
-        sample: options(batch),
-        name: "learner".to_owned(),
-        table: String::new(),
-        prefetch: 2,
-    };
-    RemoteSource::new(
-        &replay.endpoint,
-        options,
-        replay.runtime.handle(),
-        replay.waits.clone(),
-        replay.shutdown.clone(),
-    )
 }
 
 #[test]
@@ -113,7 +96,7 @@ fn priorities_move_the_draws_and_weights_make_up_for_them() {
     let prioritized = ReplayConfig { sampler: ItemSelector::Prioritized { exponent: 1.0 }, ..config() };
     let replay = Replay::start(spec(STEPS), &prioritized);
     filled(&replay.store, 1..=10);
-    let mut source = source(&replay, 64);
+    let mut source = replay.source(options(64), 2);
     let first = source.next().unwrap();
     // All have the same priority at first.
     assert!(first.items.iter().all(|item| (item.probability - 1.0 / 80.0).abs() < 1e-6));

@@ -24,17 +24,7 @@ fn local(replay: &Replay, options: SampleOptions) -> Result<Box<dyn MinibatchSou
 }
 
 fn remote(replay: &Replay, sample: SampleOptions) -> Result<Box<dyn MinibatchSource>, SampleError> {
-    let options = RemoteOptions {
-        spec: replay.spec.clone(),
-        sample,
-        name: "learner".to_owned(),
-        table: String::new(),
-        prefetch: 4,
-    };
-    let runtime = replay.runtime.handle();
-    let source =
-        RemoteSource::new(&replay.endpoint, options, runtime, replay.waits.clone(), replay.shutdown.clone());
-    Ok(Box::new(source))
+    Ok(Box::new(replay.source(sample, 4)))
 }
 
 macro_rules! both_sources {

@@ -4,7 +4,10 @@
 
 use getup_proto::v1::replay_client::ReplayClient;
 use getup_proto::{RunSpec, Segment, v1};
-use getup_replay::{ReplayConfig, ReplayMetrics, SampleOptions, ServeError, Store, StoreError, serve};
+use getup_replay::{
+    RemoteOptions, RemoteSource, ReplayConfig, ReplayMetrics, SampleOptions, ServeError, Store, StoreError,
+    serve,
+};
 use getup_telemetry::{Registry, Shutdown, Waits};
 use std::path::Path;
 use std::sync::Arc;
@@ -81,6 +84,19 @@ impl Replay {
         let started = Instant::now();
         self.shutdown.trigger();
         (self.runtime.block_on(self.serving).unwrap(), started.elapsed())
+    }
+
+    /// A source of the default table.
+    pub fn source(&self, sample: SampleOptions, prefetch: usize) -> RemoteSource {
+        let options = RemoteOptions {
+            spec: self.spec.clone(),
+            sample,
+            name: "learner".to_owned(),
+            table: String::new(),
+            prefetch,
+        };
+        let (waits, shutdown) = (self.waits.clone(), self.shutdown.clone());
+        RemoteSource::new(&self.endpoint, options, self.runtime.handle(), waits, shutdown)
     }
 
     pub fn client(&self) -> ReplayClient<Channel> {
