@@ -95,14 +95,17 @@ pub(crate) fn check() -> Result<()> {
 
 /// Runs the benchmark NAME of `benches/`, which prints its table and writes `target/bench/NAME.json`.
 pub(crate) fn bench(name: &str) -> Result<()> {
-    let folder = root().join("benches");
-    if !folder.join(format!("{name}.rs")).is_file() {
-        let mut known: Vec<String> = std::fs::read_dir(&folder)
-            .context("cannot read benches/")?
-            .filter_map(|entry| entry.ok()?.file_name().to_str()?.strip_suffix(".rs").map(str::to_owned))
-            .collect();
+    // A file, or a folder with a main.rs; what else is there they share.
+    let benchmark = |entry: std::fs::DirEntry| {
+        let path = entry.path();
+        let is_one =
+            path.extension().is_some_and(|extension| extension == "rs") || path.join("main.rs").is_file();
+        is_one.then(|| path.file_stem()?.to_str().map(str::to_owned)).flatten()
+    };
+    let entries = std::fs::read_dir(root().join("benches")).context("cannot read benches/")?;
+    let mut known: Vec<String> = entries.filter_map(|entry| benchmark(entry.ok()?)).collect();
+    if !known.iter().any(|known| known == name) {
         known.sort();
-        known.dedup();
         bail!("no benchmark {name:?}; there are: {}", known.join(", "));
     }
     run(cargo()
