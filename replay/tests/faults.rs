@@ -94,8 +94,11 @@ fn a_full_disk_does_not_hold_up_the_end_and_keeps_what_was_acknowledged() {
     let mut writer = replay.writer(1);
     let spec = replay.spec.clone();
     let durable = replay.runtime.spawn(async move {
-        let mut durable = 0;
-        for sequence in 1..=100 {
+        // However many are written at once later: one is there before the disk is full.
+        writer.send(&segment(&spec, 1, 1, STEPS)).await.unwrap();
+        writer.acknowledged(1).await.unwrap();
+        let mut durable = 1;
+        for sequence in 2..=100 {
             if writer.send(&segment(&spec, 1, sequence, STEPS)).await.is_err() {
                 break;
             }
