@@ -6,13 +6,14 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use getup_telemetry::{Backoff, Waits};
+use rand::Rng;
 use tokio::sync::{mpsc, watch};
-use tokio::time::MissedTickBehavior;
 
 use crate::link::{EpisodeResult, Heartbeat, LearnerLink, Lease, LinkError, PolicyUpdate, Reported};
 use crate::metrics::ActorMetrics;
 
-/// How often an actor says that it is there.
+/// From one heartbeat to the next, on average. The pauses are drawn from half of it to half more, so that actors whose
+/// learner was away, or that were started together, do not go on in step.
 const HEARTBEAT: Duration = Duration::from_secs(1);
 /// How long the last one may take.
 const FAREWELL: Duration = Duration::from_secs(1);
@@ -39,14 +40,11 @@ impl<'a, L: LearnerLink> Office<'a, L> {
         Self { name, link, updates, waits, metrics, lease: AtomicU64::new(0) }
     }
 
-    /// Sends a heartbeat a second, for ever; a lease that comes back goes to `leases`.
+    /// Sends a heartbeat about once a second, for ever; a lease that comes back goes to `leases`.
     pub(crate) async fn send_heartbeats(&self, leases: mpsc::Sender<Lease>) {
-        let mut ticks = tokio::time::interval(HEARTBEAT);
-        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut newest = (None, Instant::now());
         let mut last_error = None;
         loop {
-            ticks.tick().await;
             let update = self.updates.borrow().clone();
             let version = update.map(|update| update.version);
             if newest.0 != version {
@@ -69,6 +67,7 @@ impl<'a, L: LearnerLink> Office<'a, L> {
                     last_error = Some(error);
                 }
             }
+            tokio::time::sleep(HEARTBEAT.mul_f64(rand::rng().random_range(0.5..=1.5))).await;
         }
     }
 

@@ -8,6 +8,7 @@ use std::time::Duration;
 use http::Uri;
 use hyper_util::client::legacy::connect::HttpConnector;
 use hyper_util::rt::TokioIo;
+use rand::Rng;
 use rustls::pki_types::ServerName;
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
@@ -28,7 +29,8 @@ use crate::{AddressError, Credentials};
 /// A connection that comes about when it is first used, and again whenever it has to; clones share it.
 pub type Channel = InterceptedService<tonic::transport::Channel, Bearer>;
 
-/// How a channel keeps its connection.
+/// How a channel keeps its connection. Each of its times is up to a fifth longer or shorter, at random: of many clients
+/// that lose their service in the same moment not all notice it, give up, and come back together.
 #[derive(Clone, PartialEq, Debug)]
 pub struct ChannelOptions {
     /// How long a connection may take to come about: name, TCP and TLS together.
@@ -139,12 +141,17 @@ impl Credentials {
 fn endpoint(uri: Uri, options: &ChannelOptions) -> Endpoint {
     let (stream, connection) = options.window.bytes();
     Endpoint::from(uri)
-        .http2_keep_alive_interval(options.keep_alive_interval)
-        .keep_alive_timeout(options.keep_alive_timeout)
+        .http2_keep_alive_interval(spread(options.keep_alive_interval))
+        .keep_alive_timeout(spread(options.keep_alive_timeout))
         .keep_alive_while_idle(options.keep_alive_while_idle)
         .http2_adaptive_window(options.window == Window::Adaptive)
         .initial_stream_window_size(stream)
         .initial_connection_window_size(connection)
+}
+
+/// Up to a fifth more or less.
+fn spread(time: Duration) -> Duration {
+    time.mul_f64(rand::rng().random_range(0.8..=1.2))
 }
 
 /// Adds the token to each call, where there is one.
@@ -187,7 +194,7 @@ impl Connector {
     async fn connect(self, uri: Uri) -> Result<Connection, Box<dyn Error + Send + Sync>> {
         let place = uri.authority().map(ToString::to_string).unwrap_or_default();
         let patience = self.patience;
-        tokio::time::timeout(patience, self.connect_to(uri, &place))
+        tokio::time::timeout(spread(patience), self.connect_to(uri, &place))
             .await
             .unwrap_or_else(|_| Err(format!("{place} does not answer within {patience:?}")))
             .map_err(Into::into)

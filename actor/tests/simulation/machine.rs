@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard};
+use std::time::Duration;
 
 use getup_telemetry::Shutdown;
 
@@ -13,6 +14,9 @@ pub(crate) struct Machine {
     /// Its disk, where it has one.
     disk: Option<PathBuf>,
     state: Mutex<State>,
+    /// When somebody connected to it, and when it sent a heartbeat; over all its starts.
+    visits: Mutex<Vec<Duration>>,
+    heartbeats: Mutex<Vec<Duration>>,
 }
 
 #[derive(Default)]
@@ -27,7 +31,7 @@ struct State {
 
 impl Machine {
     pub(crate) fn new(name: String, disk: Option<PathBuf>) -> Self {
-        Self { name, disk, state: Mutex::default() }
+        Self { name, disk, state: Mutex::default(), visits: Mutex::default(), heartbeats: Mutex::default() }
     }
 
     /// Its disk.
@@ -78,6 +82,26 @@ impl Machine {
     /// What ends this start of the machine in order.
     pub(crate) fn shutdown(&self) -> Shutdown {
         self.state().shutdown.clone()
+    }
+
+    /// Notes that somebody connects to it.
+    pub(crate) fn visited(&self) {
+        self.visits.lock().unwrap().push(turmoil::sim_elapsed().unwrap_or_default());
+    }
+
+    /// When somebody connected to it.
+    pub(crate) fn visits(&self) -> Vec<Duration> {
+        self.visits.lock().unwrap().clone()
+    }
+
+    /// Notes that it sends a heartbeat.
+    pub(crate) fn beats(&self) {
+        self.heartbeats.lock().unwrap().push(turmoil::sim_elapsed().unwrap_or_default());
+    }
+
+    /// When it sent a heartbeat.
+    pub(crate) fn heartbeats(&self) -> Vec<Duration> {
+        self.heartbeats.lock().unwrap().clone()
     }
 
     /// Before the next start, when nothing runs any more: the disk is as it was when the power went.

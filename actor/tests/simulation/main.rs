@@ -8,6 +8,7 @@
 //! | module | what lives there |
 //! | --- | --- |
 //! | `schedule` | what happens to machines and links, out of a seed |
+//! | `herd` | many actors, and a learner that comes back to them |
 //! | `ledger` | what has happened, and the promises it is held against |
 //! | `roles`, `trainer` | the three roles; the stubs |
 //! | `machine`, `network` | the power, the disk, the wires |
@@ -16,6 +17,7 @@
 //! operating system. `GETUP_SIMULATION_SEED=N cargo test --release -p getup-actor --test simulation -- --nocapture` plays
 //! that of seed N aloud. `GETUP_TEST_FULL` plays five thousand.
 
+mod herd;
 mod ledger;
 mod machine;
 mod network;
@@ -170,4 +172,28 @@ fn a_seed_repeats_its_schedule_event_by_event() {
         assert_eq!(player.play(seed).unwrap(), first, "seed {seed}");
     }
     assert_ne!(player.play(0), player.play(1), "and another seed has another");
+}
+
+#[test]
+fn actors_do_not_come_back_all_at_once_to_a_learner_that_was_away() {
+    /// Within so long, no more than a quarter of them.
+    const WINDOW: Duration = Duration::from_millis(50);
+    let most = |moments: &[Duration]| {
+        let within = |first: &Duration| {
+            moments.iter().filter(|moment| (*first..*first + WINDOW).contains(*moment)).count()
+        };
+        moments.iter().map(within).max().unwrap_or(0)
+    };
+    for absence in [herd::Absence::Crash, herd::Absence::Hang] {
+        let folder = TempDir::new().unwrap();
+        let herd::Return { connections, mut heartbeats } = herd::play(folder.path(), absence);
+        if let herd::Absence::Crash = absence {
+            assert_eq!(connections.len(), herd::ACTORS, "each connects again, once");
+        }
+        assert!(most(&connections) <= herd::ACTORS / 4, "{absence:?}: connections at {connections:.2?}");
+        // One of each may have waited for it.
+        heartbeats.retain(|moment| *moment > Duration::from_millis(100));
+        assert!(heartbeats.len() > 4 * herd::ACTORS, "{absence:?}: {} heartbeats", heartbeats.len());
+        assert!(most(&heartbeats) <= herd::ACTORS / 4, "{absence:?}: heartbeats at {heartbeats:.2?}");
+    }
 }

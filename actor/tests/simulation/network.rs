@@ -49,6 +49,7 @@ impl Listener for Port {
 
     async fn accept(&self) -> io::Result<(Wire, SocketAddr)> {
         let (stream, from) = self.listener.accept().await?;
+        self.machine.visited();
         Ok((Wire { stream, machine: self.machine.clone() }, from))
     }
 }

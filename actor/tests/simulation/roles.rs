@@ -291,6 +291,7 @@ impl<T: LearnerLink> LearnerLink for Noted<T> {
     }
 
     async fn heartbeat(&self, beat: Heartbeat) -> Result<Option<Lease>, LinkError> {
+        self.machine.beats();
         self.link.heartbeat(beat).await
     }
 
