@@ -6,7 +6,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use getup_telemetry::{Backoff, Waits};
-use rand::Rng;
 use tokio::sync::{mpsc, watch};
 
 use crate::link::{EpisodeResult, Heartbeat, LearnerLink, Lease, LinkError, PolicyUpdate, Reported};
@@ -67,7 +66,7 @@ impl<'a, L: LearnerLink> Office<'a, L> {
                     last_error = Some(error);
                 }
             }
-            tokio::time::sleep(HEARTBEAT.mul_f64(rand::rng().random_range(0.5..=1.5))).await;
+            tokio::time::sleep(HEARTBEAT.mul_f64(rand::random_range(0.5..=1.5))).await;
         }
     }
 

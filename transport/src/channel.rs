@@ -8,7 +8,6 @@ use std::time::Duration;
 use http::Uri;
 use hyper_util::client::legacy::connect::HttpConnector;
 use hyper_util::rt::TokioIo;
-use rand::Rng;
 use rustls::pki_types::ServerName;
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
@@ -151,7 +150,7 @@ fn endpoint(uri: Uri, options: &ChannelOptions) -> Endpoint {
 
 /// Up to a fifth more or less.
 fn spread(time: Duration) -> Duration {
-    time.mul_f64(rand::rng().random_range(0.8..=1.2))
+    time.mul_f64(rand::random_range(0.8..=1.2))
 }
 
 /// Adds the token to each call, where there is one.

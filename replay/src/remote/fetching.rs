@@ -19,7 +19,7 @@ use crate::source::SampleError;
 /// Messages of credits that are enough for all that is fetched ahead.
 const CREDITS_AHEAD: u32 = 4;
 
-/// The task of a [`RemoteSource`].
+/// The task of a [`RemoteSource`](super::RemoteSource).
 pub(super) struct Fetching {
     endpoint: Endpoint,
     options: RemoteOptions,
