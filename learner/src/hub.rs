@@ -11,7 +11,7 @@ use getup_proto::{RunSpec, SpecError, v1};
 use getup_telemetry::Waits;
 use tokio::sync::watch;
 
-use crate::leases::{LeaseError, Leases};
+use crate::leases::{LeaseCounts, LeaseError, Leases};
 
 /// A heartbeat older than this says that its actor is lost.
 pub(crate) const ACTOR_LOST: Duration = Duration::from_secs(60);
@@ -261,8 +261,8 @@ impl Hub {
             .collect()
     }
 
-    /// Evaluations on offer, on lease, and how many leases were lost by their holders' silence.
-    pub fn lease_counts(&self) -> (usize, usize, u64) {
+    /// Evaluations on offer and on lease, and what became of others.
+    pub fn lease_counts(&self) -> LeaseCounts {
         self.lock().leases.counts()
     }
 

@@ -18,6 +18,7 @@ pub struct HubMetrics {
     lag: GaugeVec,
     leases: IntGaugeVec,
     expirations: IntCounter,
+    superseded: IntCounter,
 }
 
 impl HubMetrics {
@@ -30,6 +31,10 @@ impl HubMetrics {
         let behind = options("actor_versions_behind", "Policies published since the one the actor acts by.");
         let leases = options("leases", "Evaluations not reported yet, by state: offered, leased.");
         let expirations = options("lease_expirations_total", "Leases lost because their holder was silent.");
+        let superseded = options(
+            "evaluations_superseded_total",
+            "Evaluations that no actor had begun when the next was due.",
+        );
         let actors = options("actors", "Actors heard from within a minute.");
         Self {
             hub,
@@ -45,11 +50,20 @@ impl HubMetrics {
             ),
             leases: IntGaugeVec::new(leases, &["state"]).expect(WELL_FORMED),
             expirations: IntCounter::with_opts(expirations).expect(WELL_FORMED),
+            superseded: IntCounter::with_opts(superseded).expect(WELL_FORMED),
         }
     }
 
-    fn collectors(&self) -> [&dyn Collector; 6] {
-        [&self.actors, &self.silent, &self.behind, &self.lag, &self.leases, &self.expirations]
+    fn collectors(&self) -> [&dyn Collector; 7] {
+        [
+            &self.actors,
+            &self.silent,
+            &self.behind,
+            &self.lag,
+            &self.leases,
+            &self.expirations,
+            &self.superseded,
+        ]
     }
 }
 
@@ -71,10 +85,14 @@ impl Collector for HubMetrics {
             self.behind.with_label_values(&name).set(actor.versions_behind as i64);
             self.lag.with_label_values(&name).set(actor.lag.as_secs_f64());
         }
-        let (offered, leased, expirations) = hub.lease_counts();
-        self.leases.with_label_values(&["offered"]).set(offered as i64);
-        self.leases.with_label_values(&["leased"]).set(leased as i64);
-        self.expirations.inc_by(expirations.saturating_sub(self.expirations.get()));
+        let counts = hub.lease_counts();
+        self.leases.with_label_values(&["offered"]).set(counts.offered as i64);
+        self.leases.with_label_values(&["leased"]).set(counts.leased as i64);
+        for (counter, count) in
+            [(&self.expirations, counts.expirations), (&self.superseded, counts.superseded)]
+        {
+            counter.inc_by(count.saturating_sub(counter.get()));
+        }
         self.collectors().into_iter().flat_map(Collector::collect).collect()
     }
 }

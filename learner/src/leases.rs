@@ -3,6 +3,9 @@
 //! An evaluation is offered, leased to one actor, kept alive by that actor's heartbeats, and reported once; a
 //! lease whose holder falls silent is offered again under a new number, so that a late report of the old one is
 //! refused. Results leave in the order in which their evaluations were offered, which is the order of versions.
+//!
+//! One that nobody holds when the next is offered is superseded by it: where actors cannot evaluate as often as they are
+//! asked to, they evaluate the newest, and nothing piles up.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -34,19 +37,33 @@ enum State<R> {
     Reported(R),
 }
 
+/// What [`Leases::counts`] counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LeaseCounts {
+    /// Evaluations on offer now.
+    pub offered: usize,
+    /// Evaluations on lease now.
+    pub leased: usize,
+    /// Leases lost by their holders' silence, ever.
+    pub expirations: u64,
+    /// Evaluations that nobody held when the next was offered, ever.
+    pub superseded: u64,
+}
+
 /// The table: `T` is an evaluation, `R` its result.
 #[derive(Debug)]
 pub struct Leases<T, R> {
     keep_alive: Duration,
     next_id: u64,
     expirations: u64,
+    superseded: u64,
     table: VecDeque<(T, State<R>)>,
 }
 
 impl<T, R> Leases<T, R> {
     /// A table whose leases last `keep_alive` beyond the last heartbeat.
     pub fn new(keep_alive: Duration) -> Self {
-        Self { keep_alive, next_id: 1, expirations: 0, table: VecDeque::new() }
+        Self { keep_alive, next_id: 1, expirations: 0, superseded: 0, table: VecDeque::new() }
     }
 
     /// Evaluations that are offered, leased, or reported and not yet taken.
@@ -59,8 +76,11 @@ impl<T, R> Leases<T, R> {
         self.table.is_empty()
     }
 
-    /// Offers an evaluation, after all that were offered before.
+    /// Offers an evaluation, in place of those that nobody holds.
     pub fn offer(&mut self, evaluation: T) {
+        let before = self.table.len();
+        self.table.retain(|(_, state)| !matches!(state, State::Offered));
+        self.superseded += (before - self.table.len()) as u64;
         self.table.push_back((evaluation, State::Offered));
     }
 
@@ -96,12 +116,16 @@ impl<T, R> Leases<T, R> {
         }
     }
 
-    /// Evaluations on offer, on lease, and leases that were lost by their holders' silence.
-    pub fn counts(&self) -> (usize, usize, u64) {
+    /// How things stand.
+    pub fn counts(&self) -> LeaseCounts {
         let count =
             |wanted: fn(&State<R>) -> bool| self.table.iter().filter(|(_, state)| wanted(state)).count();
-        let offered = count(|state| matches!(state, State::Offered));
-        (offered, count(|state| matches!(state, State::Leased { .. })), self.expirations)
+        LeaseCounts {
+            offered: count(|state| matches!(state, State::Offered)),
+            leased: count(|state| matches!(state, State::Leased { .. })),
+            expirations: self.expirations,
+            superseded: self.superseded,
+        }
     }
 
     /// Takes the report of a lease.
@@ -185,8 +209,8 @@ mod tests {
     fn results_leave_in_the_order_of_the_offers() {
         let (mut leases, now) = (Leases::new(KEEP_ALIVE), Instant::now());
         leases.offer("a");
-        leases.offer("b");
         let (first, _) = leases.acquire("actor-1", now).unwrap();
+        leases.offer("b");
         let (second, _) = leases.acquire("actor-2", now).unwrap();
         leases.report(second, 2).unwrap();
         assert_eq!(leases.take_reported(), None);
@@ -195,14 +219,26 @@ mod tests {
         assert_eq!(leases.take_reported(), Some(("b", 2)));
     }
 
+    #[test]
+    fn what_nobody_holds_gives_way_to_the_next() {
+        let (mut leases, now) = (Leases::<_, ()>::new(KEEP_ALIVE), Instant::now());
+        leases.offer("held");
+        leases.acquire("actor-1", now).unwrap();
+        for name in ["late", "later", "newest"] {
+            leases.offer(name);
+        }
+        assert_eq!(leases.acquire("actor-2", now).unwrap().1, &"newest");
+        assert_eq!(leases.counts(), LeaseCounts { offered: 0, leased: 2, expirations: 0, superseded: 2 });
+    }
+
     proptest! {
         #[test]
-        fn whatever_actors_do_each_evaluation_gives_one_result_in_order(
+        fn whatever_actors_do_each_evaluation_gives_one_result_in_order_or_gives_way(
             moves in proptest::collection::vec((0u8..5, 0u64..4, 0u64..12), 1..300)
         ) {
             let mut leases = Leases::new(KEEP_ALIVE);
             let mut now = Instant::now();
-            let (mut offered, mut taken) = (0u64, 0u64);
+            let (mut offered, mut taken) = (0u64, Vec::new());
             let mut held: Vec<u64> = Vec::new();
             for (action, actor, seconds) in moves {
                 now += Duration::from_secs(seconds);
@@ -222,12 +258,14 @@ mod tests {
                         prop_assert!(leases.report(lease, 0).is_err(), "never twice");
                     },
                     _ => while let Some((evaluation, result)) = leases.take_reported() {
-                        prop_assert_eq!(evaluation, taken);
-                        prop_assert_eq!(result, taken);
-                        taken += 1;
+                        prop_assert_eq!(evaluation, result);
+                        prop_assert!(taken.last() < Some(&evaluation), "each once, in order");
+                        taken.push(evaluation);
                     },
                 }
-                prop_assert_eq!(leases.len() as u64, offered - taken);
+                let counts = leases.counts();
+                prop_assert_eq!(leases.len() as u64, offered - taken.len() as u64 - counts.superseded);
+                prop_assert!(counts.offered <= 1 + counts.expirations as usize);
             }
         }
     }
