@@ -33,6 +33,8 @@ const PREFETCH: usize = 8;
 const ASK_EVERY: Duration = Duration::from_millis(2);
 /// How long the first answer of each part may take.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// Appends, the sizes of minibatch, broadcasts.
+const PARTS: usize = 2 + BATCHES.len();
 
 /// Measure a running cluster: appends, minibatches and broadcasts, by the real protocol.
 ///
@@ -129,10 +131,14 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
             time,
             waits: Waits::new(&Registry::new()),
         };
-        bench.measure().await
-    })?;
+        // Every part has its own limits; this is one for what no part thought of.
+        let limit = PARTS as u32 * (time + 2 * PATIENCE);
+        let measured = timeout(limit, bench.measure()).await;
+        measured.unwrap_or_else(|_| Err(bench.unanswered("the measurement did not end", limit)))
+    });
     // What still waits for an answer is not waited for.
     runtime.shutdown_background();
+    let report = report?;
     if arguments.json {
         println!("{}", serde_json::to_string(&report)?);
     } else {
@@ -166,7 +172,8 @@ impl Report {
 impl Bench {
     async fn measure(&self) -> Result<Report> {
         for replay in &self.replays {
-            let described = getup_replay::describe(replay.clone()).await;
+            let described = timeout(PATIENCE, getup_replay::describe(replay.clone())).await;
+            let described = described.map_err(|_| self.unanswered("the replay does not answer", PATIENCE))?;
             let described =
                 described.map_err(|status| anyhow::anyhow!("{}: {}", replay.address, status.message()))?;
             ensure!(
@@ -177,7 +184,7 @@ impl Bench {
                 described.tables.join(", ")
             );
         }
-        let bar = progress_bar(2 + BATCHES.len() as u64, "parts");
+        let bar = progress_bar(PARTS as u64, "parts");
         let (mut times, env_steps, bytes) = self.append().await?;
         bar.inc(1);
         let mut samples = Vec::new();
@@ -222,7 +229,7 @@ impl Bench {
         // The first of each connects.
         let connecting = try_join_all(writers.iter_mut().map(Writer::append_one));
         let connected = timeout(PATIENCE, connecting).await;
-        connected.map_err(|_| self.unanswered("not every writer was acknowledged"))??;
+        connected.map_err(|_| self.unanswered("not every writer was acknowledged", PATIENCE))??;
         let until = Instant::now() + self.time;
         let appended = writers.into_iter().map(|writer| tokio::spawn(writer.append_until(until)));
         let mut all = (Vec::new(), 0, 0);
@@ -264,7 +271,7 @@ impl Bench {
             }
             Ok::<_, getup_replay::SampleError>(Some(count as f64 / began.elapsed().as_secs_f64()))
         });
-        counted.await??.ok_or_else(|| self.unanswered("no minibatch came"))
+        counted.await??.ok_or_else(|| self.unanswered("no minibatch came", PATIENCE))
     }
 
     /// Listeners hear policies, while the learner is asked which is its newest: a lag is counted from the last answer that
@@ -298,7 +305,7 @@ impl Bench {
             // Each hears the newest first, which was there before.
             let first = try_join_all(updates.iter_mut().map(|updates| updates.wait_for(Option::is_some)));
             let first = timeout(PATIENCE, first).await;
-            first.map_err(|_| self.unanswered("not every listener heard a policy"))??;
+            first.map_err(|_| self.unanswered("not every listener heard a policy", PATIENCE))??;
             self.publications().await
         };
         let published = tokio::select! {
@@ -328,7 +335,8 @@ impl Bench {
         while tokio::time::Instant::now() < until {
             let asking = Instant::now();
             let status = timeout(PATIENCE, client.status(v1::StatusRequest {})).await;
-            let status = status.map_err(|_| self.unanswered("the learner does not answer"))??.into_inner();
+            let status =
+                status.map_err(|_| self.unanswered("the learner does not answer", PATIENCE))??.into_inner();
             let version = PolicyVersion::from(status.version.unwrap_or_default());
             // The first was there before.
             if newest.replace(version).is_some_and(|before| before != version) {
@@ -340,9 +348,9 @@ impl Bench {
         Ok(published)
     }
 
-    fn unanswered(&self, what: &str) -> anyhow::Error {
+    fn unanswered(&self, what: &str, limit: Duration) -> anyhow::Error {
         let waits: Vec<String> = self.waits.current().iter().map(ToString::to_string).collect();
-        anyhow::anyhow!("{what} within {PATIENCE:?}: {}", waits.join("; "))
+        anyhow::anyhow!("{what} within {limit:?}: {}", waits.join("; "))
     }
 }
 
