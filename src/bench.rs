@@ -303,8 +303,7 @@ impl Bench {
         let measured = async {
             let mut updates = updates;
             // Each hears the newest first, which was there before.
-            let first = try_join_all(updates.iter_mut().map(|updates| updates.wait_for(Option::is_some)));
-            let first = timeout(PATIENCE, first).await;
+            let first = timeout(PATIENCE, all_heard(&mut updates)).await;
             first.map_err(|_| self.unanswered("not every listener heard a policy", PATIENCE))??;
             self.publications().await
         };
@@ -354,6 +353,13 @@ impl Bench {
     }
 }
 
+/// Waits until there is something in each. Nothing stays borrowed meanwhile: whoever puts the next thing in the place of a
+/// borrowed one would wait for this, and this for the others.
+async fn all_heard<T>(slots: &mut [watch::Receiver<Option<T>>]) -> Result<(), watch::error::RecvError> {
+    let heard = async |slot: &mut watch::Receiver<Option<T>>| slot.wait_for(Option::is_some).await.map(drop);
+    try_join_all(slots.iter_mut().map(heard)).await.map(drop)
+}
+
 /// A simulated actor's way to a replay.
 struct Writer {
     link: GrpcReplay,
@@ -388,4 +394,21 @@ impl Writer {
 /// The median and the 99th percentile of seconds, in milliseconds.
 fn milliseconds(seconds: Vec<f64>) -> [f64; 2] {
     percentiles(seconds, [0.5, 0.99]).map(|value| 1e3 * value.unwrap_or(f64::NAN))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use futures::FutureExt;
+
+    #[tokio::test]
+    async fn who_heard_first_hears_on_while_the_others_are_waited_for() {
+        let (early, first) = watch::channel(Some(1));
+        let (_late, second) = watch::channel(None);
+        let mut slots = [first, second];
+        let mut heard = std::pin::pin!(all_heard(&mut slots));
+        assert!(heard.as_mut().now_or_never().is_none(), "the second has heard nothing");
+        let next = tokio::task::spawn_blocking(move || early.send_replace(Some(2)));
+        assert_eq!(timeout(PATIENCE, next).await.expect("nobody holds the first one's").unwrap(), Some(1));
+    }
 }
