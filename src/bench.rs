@@ -33,6 +33,8 @@ const PREFETCH: usize = 8;
 const ASK_EVERY: Duration = Duration::from_millis(2);
 /// How long the first answer of each part may take.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// The longest that a part may be measured.
+const LONGEST: Duration = Duration::from_secs(3600);
 /// Appends, the sizes of minibatch, broadcasts.
 const PARTS: usize = 2 + BATCHES.len();
 
@@ -109,8 +111,9 @@ struct Bench {
 
 pub(crate) fn run(arguments: Args) -> Result<()> {
     let config = arguments.config.load()?;
-    let time = Duration::try_from_secs_f64(arguments.seconds).ok().filter(|time| !time.is_zero());
-    let time = time.with_context(|| format!("--seconds {}: over 0", arguments.seconds))?;
+    let time = Duration::try_from_secs_f64(arguments.seconds).ok();
+    let time = time.filter(|time| !time.is_zero() && *time <= LONGEST);
+    let time = time.with_context(|| format!("--seconds {}: over 0, at most an hour", arguments.seconds))?;
     ensure!(arguments.writers > 0, "--writers 0: at least one");
     ensure!(
         arguments.yes || arguments.table != getup_replay::DEFAULT_TABLE,
