@@ -7,7 +7,9 @@
 use getup_policy::NORM_EPSILON;
 use multiversion::multiversion;
 
+use super::layout::Rows;
 use super::math;
+use super::product::Numbers;
 
 /// Numbers of the widest vector; R is a multiple of it.
 pub(super) const LANES: usize = 16;
@@ -32,12 +34,92 @@ pub(super) fn add_bias_relu(values: &mut [f32], bias: &[f32], rows: usize) {
     }
 }
 
-/// Keeps the gradient where the ReLU's result was positive.
+/// `to = from + bias`, row by row.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-pub(super) fn relu_gradient(gradient: &mut [f32], result: &[f32]) {
-    for (gradient, result) in gradient.iter_mut().zip(result) {
-        *gradient = if *result > 0.0 { *gradient } else { 0.0 };
+pub(super) fn copy_with_bias(from: &[f32], bias: &[f32], rows: usize, to: &mut [f32]) {
+    for ((to, from), bias) in to.chunks_exact_mut(rows).zip(from.chunks_exact(rows)).zip(bias) {
+        to.iter_mut().zip(from).for_each(|(to, from)| *to = *from + *bias);
     }
+}
+
+/// A matrix, `[F, R]`, plus a number for every row, as far as it is positive.
+pub(super) struct BiasRelu<'a> {
+    pub(super) values: &'a [f32],
+    pub(super) bias: &'a [f32],
+    pub(super) rows: usize,
+}
+
+impl Rows for BiasRelu<'_> {
+    #[inline(always)]
+    fn lanes(&mut self, row: usize, at: usize) -> [f32; LANES] {
+        let bias = self.bias[row];
+        lanes(self.values, row * self.rows + at).map(|value| {
+            let sum = value + bias;
+            // As above: NaN stays NaN.
+            if sum < 0.0 { 0.0 } else { sum }
+        })
+    }
+}
+
+/// The gradient of a layer's result, `[F, R]`, where its ReLU let through; and its sums, which are the gradient of the
+/// layer's bias.
+pub(super) struct Gradient<'a> {
+    values: &'a [f32],
+    /// The ReLU's result, where the layer has one.
+    result: Option<Numbers<'a>>,
+    rows: usize,
+    /// `[F]`, where they are asked for.
+    sums: Option<&'a mut [f32]>,
+    /// Of the row that is being read.
+    sum: [f32; LANES],
+}
+
+impl<'a> Gradient<'a> {
+    pub(super) fn new(
+        values: &'a [f32],
+        result: Option<Numbers<'a>>,
+        rows: usize,
+        sums: Option<&'a mut [f32]>,
+    ) -> Self {
+        Self { values, result, rows, sums, sum: [0.0; LANES] }
+    }
+}
+
+impl Rows for Gradient<'_> {
+    #[inline(always)]
+    fn lanes(&mut self, row: usize, at: usize) -> [f32; LANES] {
+        let start = row * self.rows + at;
+        let mut values = lanes(self.values, start);
+        match self.result {
+            None => {}
+            Some(Numbers::F32(result)) => {
+                let result = lanes(result, start);
+                (0..LANES).for_each(|lane| values[lane] = if result[lane] > 0.0 { values[lane] } else { 0.0 });
+            }
+            Some(Numbers::Bf16(result)) => {
+                let result: [u16; LANES] = lanes(result, start);
+                // Not zero and no sign: a NaN may pass.
+                let positive = |bits: u16| bits.wrapping_sub(1) < 0x7fff;
+                (0..LANES).for_each(|lane| values[lane] = if positive(result[lane]) { values[lane] } else { 0.0 });
+            }
+        }
+        (0..LANES).for_each(|lane| self.sum[lane] += values[lane]);
+        values
+    }
+
+    #[inline(always)]
+    fn end(&mut self, row: usize) {
+        if let Some(sums) = &mut self.sums {
+            sums[row] = total(&self.sum);
+        }
+        self.sum = [0.0; LANES];
+    }
+}
+
+/// Whole lanes of a matrix whose rows are whole lanes.
+#[inline(always)]
+fn lanes<T: Copy>(values: &[T], start: usize) -> [T; LANES] {
+    *values[start..].first_chunk().expect("rows are whole lanes")
 }
 
 /// The sum of every row: the gradient of a bias.
@@ -62,50 +144,52 @@ fn total(lanes: &[f32; LANES]) -> f32 {
     lanes[0]
 }
 
-/// Layer norm over the features of every transition: `normal = (x − mean) / √(variance + ε)`,
-/// `result = normal · weight + bias`; `inverse`, `[R]`, receives 1 / √(variance + ε).
+/// What a layer norm needs to know of every transition: `mean` over the features, and `inverse` = 1 / √(variance + ε),
+/// `[R]` each.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-pub(super) fn layer_norm(
-    x: &[f32],
-    weight: &[f32],
-    bias: &[f32],
-    normal: &mut [f32],
-    inverse: &mut [f32],
-    result: &mut [f32],
-) {
-    let rows = inverse.len();
-    let scale = 1.0 / weight.len() as f32;
-    for start in (0..rows).step_by(LANES) {
-        let part = |row: usize| row * rows + start..row * rows + start + LANES;
-        let mut mean = [0.0f32; LANES];
-        for row in 0..weight.len() {
-            let x = &x[part(row)];
-            (0..LANES).for_each(|lane| mean[lane] += x[lane]);
+pub(super) fn moments(x: &[f32], mean: &mut [f32], inverse: &mut [f32]) {
+    let rows = mean.len();
+    let scale = 1.0 / (x.len() / rows) as f32;
+    mean.fill(0.0);
+    for x in x.chunks_exact(rows) {
+        mean.iter_mut().zip(x).for_each(|(mean, x)| *mean += x);
+    }
+    mean.iter_mut().for_each(|mean| *mean *= scale);
+    inverse.fill(0.0);
+    for x in x.chunks_exact(rows) {
+        for ((sum, mean), x) in inverse.iter_mut().zip(&*mean).zip(x) {
+            let deviation = x - mean;
+            *sum += deviation * deviation;
         }
-        (0..LANES).for_each(|lane| mean[lane] *= scale);
-        let mut squares = [0.0f32; LANES];
-        for row in 0..weight.len() {
-            let x = &x[part(row)];
-            (0..LANES).for_each(|lane| {
-                let deviation = x[lane] - mean[lane];
-                squares[lane] += deviation * deviation;
-            });
-        }
-        let inverse = &mut inverse[start..start + LANES];
-        (0..LANES).for_each(|lane| inverse[lane] = 1.0 / (squares[lane] * scale + NORM_EPSILON).sqrt());
-        for row in 0..weight.len() {
-            let (weight, bias) = (weight[row], bias[row]);
-            let (x, normal, result) = (&x[part(row)], &mut normal[part(row)], &mut result[part(row)]);
-            (0..LANES).for_each(|lane| {
-                normal[lane] = (x[lane] - mean[lane]) * inverse[lane];
-                result[lane] = normal[lane] * weight + bias;
-            });
-        }
+    }
+    inverse.iter_mut().for_each(|sum| *sum = 1.0 / (*sum * scale + NORM_EPSILON).sqrt());
+}
+
+/// A layer norm over the features of every transition: `normal = (x − mean) / √(variance + ε)`, which is kept, and
+/// `normal · weight + bias`.
+pub(super) struct Normal<'a> {
+    pub(super) x: &'a [f32],
+    pub(super) mean: &'a [f32],
+    pub(super) inverse: &'a [f32],
+    pub(super) weight: &'a [f32],
+    pub(super) bias: &'a [f32],
+    pub(super) normal: &'a mut [f32],
+}
+
+impl Rows for Normal<'_> {
+    #[inline(always)]
+    fn lanes(&mut self, row: usize, at: usize) -> [f32; LANES] {
+        let start = row * self.mean.len() + at;
+        let [mut x, mean, inverse] = [lanes(self.x, start), lanes(self.mean, at), lanes(self.inverse, at)];
+        (0..LANES).for_each(|lane| x[lane] = (x[lane] - mean[lane]) * inverse[lane]);
+        self.normal[start..start + LANES].copy_from_slice(&x);
+        let (weight, bias) = (self.weight[row], self.bias[row]);
+        x.map(|normal| normal * weight + bias)
     }
 }
 
 /// Adds the gradient of a layer norm's input to `to`, given that of its result. `parameters` receives the gradients
-/// of weight and bias, where they are asked for.
+/// of weight and bias, where they are asked for; `scratch` is `[R]` each.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 pub(super) fn layer_norm_gradient(
     gradient: &[f32],
@@ -113,43 +197,42 @@ pub(super) fn layer_norm_gradient(
     normal: &[f32],
     inverse: &[f32],
     to: &mut [f32],
-    parameters: Option<(&mut [f32], &mut [f32])>,
+    mut parameters: Option<(&mut [f32], &mut [f32])>,
+    scratch: [&mut [f32]; 2],
 ) {
     let rows = inverse.len();
     let scale = 1.0 / weight.len() as f32;
-    for start in (0..rows).step_by(LANES) {
-        let part = |row: usize| row * rows + start..row * rows + start + LANES;
-        let (mut sums, mut products) = ([0.0f32; LANES], [0.0f32; LANES]);
-        for row in 0..weight.len() {
-            let (weight, gradient, normal) = (weight[row], &gradient[part(row)], &normal[part(row)]);
+    let [sums, products] = scratch.map(|scratch| &mut scratch[..rows]);
+    sums.fill(0.0);
+    products.fill(0.0);
+    let matrices = || gradient.chunks_exact(rows).zip(normal.chunks_exact(rows)).zip(weight);
+    for (row, ((gradient, normal), weight)) in matrices().enumerate() {
+        let (mut by_weight, mut by_bias) = ([0.0f32; LANES], [0.0f32; LANES]);
+        let lanes = gradient.chunks_exact(LANES).zip(normal.chunks_exact(LANES));
+        let scratch = sums.chunks_exact_mut(LANES).zip(products.chunks_exact_mut(LANES));
+        for ((gradient, normal), (sums, products)) in lanes.zip(scratch) {
             (0..LANES).for_each(|lane| {
-                let weighted = gradient[lane] * weight;
-                sums[lane] += weighted;
-                products[lane] += weighted * normal[lane];
+                let product = gradient[lane] * normal[lane];
+                by_weight[lane] += product;
+                by_bias[lane] += gradient[lane];
+                sums[lane] += gradient[lane] * weight;
+                products[lane] += product * weight;
             });
         }
-        let inverse = &inverse[start..start + LANES];
-        for row in 0..weight.len() {
-            let (weight, gradient, normal) = (weight[row], &gradient[part(row)], &normal[part(row)]);
-            let to = &mut to[part(row)];
-            (0..LANES).for_each(|lane| {
-                let centred = gradient[lane] * weight - (sums[lane] + normal[lane] * products[lane]) * scale;
-                to[lane] += inverse[lane] * centred;
-            });
+        if let Some((weights, biases)) = &mut parameters {
+            weights[row] = total(&by_weight);
+            biases[row] = total(&by_bias);
         }
     }
-    let Some((weights, biases)) = parameters else { return };
-    for row in 0..weight.len() {
-        let (mut weight, mut bias) = ([0.0f32; LANES], [0.0f32; LANES]);
-        let (gradient, normal) = (&gradient[row * rows..][..rows], &normal[row * rows..][..rows]);
-        for (gradient, normal) in gradient.chunks_exact(LANES).zip(normal.chunks_exact(LANES)) {
-            (0..LANES).for_each(|lane| {
-                weight[lane] += gradient[lane] * normal[lane];
-                bias[lane] += gradient[lane];
-            });
+    sums.iter_mut().zip(&mut *products).for_each(|(sum, product)| {
+        *sum *= scale;
+        *product *= scale;
+    });
+    for (((gradient, normal), weight), to) in matrices().zip(to.chunks_exact_mut(rows)) {
+        let (normal, inverse) = (&normal[..to.len()], &inverse[..to.len()]);
+        for i in 0..to.len() {
+            to[i] += inverse[i] * (gradient[i] * weight - (sums[i] + normal[i] * products[i]));
         }
-        weights[row] = total(&weight);
-        biases[row] = total(&bias);
     }
 }
 

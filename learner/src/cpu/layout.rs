@@ -1,5 +1,5 @@
-//! The layouts that products read: rows rounded to bfloat16, two rows interleaved, rows turned into columns. Each is
-//! written for AVX-512 and plainly, and chosen at run time.
+//! The layouts that products read: rows rounded to bfloat16, two rows interleaved, rows turned into columns. What is
+//! laid out comes from [`Rows`], straight from the pass that computes it.
 
 use multiversion::multiversion;
 
@@ -14,137 +14,168 @@ pub(super) struct Layout {
     pub(super) stride: usize,
 }
 
+/// Numbers on their way into a layout, row by row: what a pass between two products computes, so that it need not
+/// be written to memory and read again.
+pub(super) trait Rows {
+    /// Numbers `at..at + LANES` of a row; those past its end do not matter.
+    fn lanes(&mut self, row: usize, at: usize) -> [f32; LANES];
+
+    /// All of a row was asked for.
+    fn end(&mut self, _row: usize) {}
+}
+
+/// Rows as they are.
+pub(super) struct AsTheyAre<'a> {
+    pub(super) values: &'a [f32],
+    /// Of a row.
+    pub(super) length: usize,
+}
+
+impl Rows for AsTheyAre<'_> {
+    #[inline(always)]
+    fn lanes(&mut self, row: usize, at: usize) -> [f32; LANES] {
+        let rest = &self.values[row * self.length + at..];
+        match rest.first_chunk() {
+            Some(lanes) => *lanes,
+            None => std::array::from_fn(|lane| rest.get(lane).copied().unwrap_or(0.0)),
+        }
+    }
+}
+
 /// The upper half of a float32, rounded to nearest, ties to even. A NaN stays one: only those with a payload that
 /// no operation makes would carry over.
 #[inline(always)]
-fn bf16(value: f32) -> u32 {
+fn bf16(value: f32) -> u16 {
     let bits = value.to_bits();
-    (bits.wrapping_add(0x7fff + ((bits >> 16) & 1))) >> 16
+    ((bits.wrapping_add(0x7fff + ((bits >> 16) & 1))) >> 16) as u16
 }
 
-/// Rounds rows to bfloat16: as they are (`plain`), and two rows interleaved (`pairs`, where there is room). An odd
-/// last row pairs with zeros.
-pub(super) fn pack_bf16(values: &[f32], layout: Layout, plain: &mut [u16], pairs: &mut [u32]) {
-    let Layout { length, stride } = layout;
-    assert!(
-        values.len().is_multiple_of(length) && length <= stride,
-        "rows of {length} in {} numbers",
-        values.len()
-    );
-    #[cfg(target_arch = "x86_64")]
-    let native = is_x86_feature_detected!("avx512bf16") && is_x86_feature_detected!("avx512vl");
-    let mut pairs = pairs.chunks_exact_mut(length);
-    for (from, plain) in values.chunks(2 * length).zip(plain.chunks_mut(2 * stride)) {
-        let (even, odd) = from.split_at(length);
-        let (plain_even, plain_odd) = plain.split_at_mut(stride);
-        let plain_even = &mut plain_even[..length];
-        let rows = match (odd.is_empty(), pairs.next()) {
-            (false, Some(pairs)) => [(even, odd, plain_even, &mut plain_odd[..length], pairs)],
-            (true, Some(pairs)) => {
-                round_row(even, plain_even);
-                plain_even.iter().zip(pairs).for_each(|(plain, pair)| *pair = u32::from(*plain));
-                continue;
-            }
-            (lone, None) => {
-                round_row(even, plain_even);
-                if !lone {
-                    round_row(odd, &mut plain_odd[..length]);
-                }
-                continue;
-            }
-        };
-        let [(even, odd, plain_even, plain_odd, pairs)] = rows;
-        #[cfg(target_arch = "x86_64")]
-        if native {
-            // SAFETY: the processor has AVX512-BF16 and AVX512-VL, and with them AVX-512 F; all five have `length`.
-            unsafe { pack_rows_avx512(even, odd, plain_even, plain_odd, pairs) };
-            continue;
-        }
-        pack_rows(even, odd, plain_even, plain_odd, pairs);
-    }
-}
-
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn round_row(values: &[f32], plain: &mut [u16]) {
-    plain.iter_mut().zip(values).for_each(|(plain, value)| *plain = bf16(*value) as u16);
-}
-
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn pack_rows(even: &[f32], odd: &[f32], plain_even: &mut [u16], plain_odd: &mut [u16], pairs: &mut [u32]) {
-    let rows = even.iter().zip(odd).zip(plain_even).zip(plain_odd).zip(pairs);
-    for ((((even, odd), plain_even), plain_odd), pair) in rows {
-        let (low, high) = (bf16(*even), bf16(*odd));
-        *plain_even = low as u16;
-        *plain_odd = high as u16;
-        *pair = low | (high << 16);
-    }
-}
-
+/// [`bf16`] by the processor's own instruction.
+///
 /// # Safety
-/// The processor has AVX-512 F and VL and AVX512-BF16; all five slices have the length of the first.
+/// The processor has AVX-512 F and AVX512-BF16.
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx512vl,avx512bf16")]
-unsafe fn pack_rows_avx512(
-    even: &[f32],
-    odd: &[f32],
-    plain_even: &mut [u16],
-    plain_odd: &mut [u16],
+#[target_feature(enable = "avx512f,avx512bf16")]
+#[inline]
+unsafe fn bf16_native(values: &[f32; LANES]) -> [u16; LANES] {
+    use std::arch::x86_64::*;
+    // SAFETY: as the caller promises; 16 numbers are read, and 16 of bfloat16 are 32 bytes either way.
+    unsafe { std::mem::transmute(_mm512_cvtneps_pbh(_mm512_loadu_ps(values.as_ptr()))) }
+}
+
+/// Rounds `count` rows to bfloat16: as they are (`plain`), and two rows interleaved (`pairs`, where there is room). An
+/// odd last row pairs with zeros.
+#[multiversion(targets(
+    "x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx512bf16",
+    "x86_64+avx512f+avx512bw+avx512dq+avx512vl",
+    "x86_64+avx2+fma"
+))]
+pub(super) fn pack_bf16<R: Rows>(
+    rows: &mut R,
+    count: usize,
+    layout: Layout,
+    plain: &mut [u16],
     pairs: &mut [u32],
 ) {
-    use std::arch::x86_64::*;
-    let whole = even.len() - even.len() % LANES;
-    for i in (0..whole).step_by(LANES) {
-        // SAFETY: as the caller promises, 16 numbers from i on are in every slice; the two vectors of bfloat16 are 32
-        // bytes either way.
-        unsafe {
-            let round = |values: &[f32]| -> __m256i {
-                std::mem::transmute(_mm512_cvtneps_pbh(_mm512_loadu_ps(values.as_ptr().add(i))))
+    let native = multiversion::target::selected_target!().supports_feature_str("avx512bf16");
+    let Layout { length, stride } = layout;
+    assert!(length <= stride, "rows of {length} numbers, {stride} apart");
+    for row in 0..count {
+        let (before, this) = plain.split_at_mut(row * stride);
+        let this = &mut this[..length];
+        let even = if row % 2 == 1 { &before[(row - 1) * stride..][..length] } else { &[] };
+        let lone = row + 1 == count && row % 2 == 0;
+        let pair = match pairs.is_empty() || (row % 2 == 0 && !lone) {
+            true => &mut [],
+            false => &mut pairs[row / 2 * length..][..length],
+        };
+        for at in (0..length).step_by(LANES) {
+            let values = rows.lanes(row, at);
+            #[cfg(target_arch = "x86_64")]
+            let rounded = match native {
+                // SAFETY: this is the version for processors with AVX-512 F and AVX512-BF16.
+                true => unsafe { bf16_native(&values) },
+                false => values.map(bf16),
             };
-            let (low, high) = (round(even), round(odd));
-            _mm256_storeu_si256(plain_even.as_mut_ptr().add(i).cast(), low);
-            _mm256_storeu_si256(plain_odd.as_mut_ptr().add(i).cast(), high);
-            let high = _mm512_slli_epi32::<16>(_mm512_cvtepu16_epi32(high));
-            let pair = _mm512_or_si512(_mm512_cvtepu16_epi32(low), high);
-            _mm512_storeu_si512(pairs.as_mut_ptr().add(i).cast(), pair);
+            #[cfg(not(target_arch = "x86_64"))]
+            let rounded = values.map(bf16);
+            store(&rounded, &mut this[at..]);
+            if pair.is_empty() {
+                continue;
+            }
+            let mut words = rounded.map(u32::from);
+            if let Some(even) = even.get(at..) {
+                match even.first_chunk::<LANES>() {
+                    Some(even) => (0..LANES).for_each(|i| words[i] = words[i] << 16 | u32::from(even[i])),
+                    None => words.iter_mut().zip(even).for_each(|(word, even)| {
+                        *word = *word << 16 | u32::from(*even);
+                    }),
+                }
+            }
+            store(&words, &mut pair[at..]);
         }
+        rows.end(row);
     }
-    let (plain_even, plain_odd) = (&mut plain_even[whole..], &mut plain_odd[whole..]);
-    pack_rows(&even[whole..], &odd[whole..], plain_even, plain_odd, &mut pairs[whole..]);
 }
 
-/// Turns `[rows, columns]` words into `[columns, rows]`, by blocks that fit into registers.
-pub(super) fn transpose(from: &[u32], rows: usize, columns: usize, to: &mut [u32]) {
-    assert!(from.len() >= rows * columns && to.len() >= rows * columns, "{rows} × {columns} words");
-    #[cfg(target_arch = "x86_64")]
-    if is_x86_feature_detected!("avx512f") {
-        // SAFETY: the processor has AVX-512 F, and both slices hold rows × columns words (asserted).
-        unsafe { transpose_avx512(from, rows, columns, to) };
+/// Writes rows of `length` numbers as they are.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+pub(super) fn write<R: Rows>(rows: &mut R, length: usize, to: &mut [f32]) {
+    for (row, to) in to.chunks_exact_mut(length).enumerate() {
+        for at in (0..length).step_by(LANES) {
+            store(&rows.lanes(row, at), &mut to[at..]);
+        }
+        rows.end(row);
+    }
+}
+
+/// As many of the lanes as there is room for.
+#[inline(always)]
+fn store<T: Copy>(lanes: &[T; LANES], to: &mut [T]) {
+    match to.first_chunk_mut() {
+        Some(to) => *to = *lanes,
+        None => to.copy_from_slice(&lanes[..to.len()]),
+    }
+}
+
+/// Turns `[rows, columns]` words into `[columns, rows]`, by blocks that fit into registers; `stride` words of `to` lie
+/// from one of its rows to the next.
+pub(super) fn transpose(from: &[u32], rows: usize, columns: usize, to: &mut [u32], stride: usize) {
+    if rows * columns == 0 {
         return;
     }
-    transpose_by_words(from, rows, columns, to, 0..rows, 0..columns);
+    let room = (columns - 1) * stride + rows;
+    assert!(from.len() >= rows * columns && to.len() >= room && rows <= stride, "{rows} × {columns} words");
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") {
+        // SAFETY: the processor has AVX-512 F, and both slices hold rows × columns words at their strides (asserted).
+        unsafe { transpose_avx512(from, rows, columns, to, stride) };
+        return;
+    }
+    transpose_by_words(from, columns, to, stride, 0..rows, 0..columns);
 }
 
 /// The same, word by word, for some rows and columns.
 pub(super) fn transpose_by_words(
     from: &[u32],
-    rows: usize,
     columns: usize,
     to: &mut [u32],
+    stride: usize,
     row_range: std::ops::Range<usize>,
     column_range: std::ops::Range<usize>,
 ) {
     for column in column_range {
         for row in row_range.clone() {
-            to[column * rows + row] = from[row * columns + column];
+            to[column * stride + row] = from[row * columns + column];
         }
     }
 }
 
 /// # Safety
-/// The processor has AVX-512 F, and both slices hold `rows · columns` words.
+/// The processor has AVX-512 F, and both slices hold `rows · columns` words at their strides.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
-unsafe fn transpose_avx512(from: &[u32], rows: usize, columns: usize, to: &mut [u32]) {
+unsafe fn transpose_avx512(from: &[u32], rows: usize, columns: usize, to: &mut [u32], stride: usize) {
     let (whole_rows, whole_columns) = (rows - rows % LANES, columns - columns % LANES);
     for row in (0..whole_rows).step_by(LANES) {
         for column in (0..whole_columns).step_by(LANES) {
@@ -152,13 +183,13 @@ unsafe fn transpose_avx512(from: &[u32], rows: usize, columns: usize, to: &mut [
             // which are inside.
             unsafe {
                 let source = from.as_ptr().add(row * columns + column);
-                let target = to.as_mut_ptr().add(column * rows + row);
-                transpose_block(source, columns, target, rows);
+                let target = to.as_mut_ptr().add(column * stride + row);
+                transpose_block(source, columns, target, stride);
             }
         }
     }
-    transpose_by_words(from, rows, columns, to, 0..rows, whole_columns..columns);
-    transpose_by_words(from, rows, columns, to, whole_rows..rows, 0..whole_columns);
+    transpose_by_words(from, columns, to, stride, 0..rows, whole_columns..columns);
+    transpose_by_words(from, columns, to, stride, whole_rows..rows, 0..whole_columns);
 }
 
 /// A block of 16 × 16 words.

@@ -10,6 +10,7 @@
 mod kernels;
 mod layout;
 mod math;
+mod memory;
 mod network;
 mod product;
 mod step;

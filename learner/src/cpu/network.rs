@@ -7,8 +7,10 @@ use std::ops::Range;
 
 use getup_policy::Body;
 
-use super::kernels;
-use super::product::{Aligned, Format, Operand, Weights, weight_gradient, zeros};
+use super::kernels::{self, BiasRelu, Gradient, Normal};
+use super::layout::{self, AsTheyAre};
+use super::memory::{Buffer, Memory};
+use super::product::{Format, Numbers, Operand, Weights, weight_gradient, weight_gradient_transposed};
 
 /// `y = W·x + b`.
 #[derive(Clone, Debug)]
@@ -59,6 +61,29 @@ impl Linear {
 impl Norm {
     fn split<'a>(&self, values: &'a [f32]) -> (&'a [f32], &'a [f32]) {
         values[self.range.clone()].split_at(self.width)
+    }
+
+    fn forward<'a>(&self, values: &'a [f32], x: &'a [f32], saved: &'a mut SavedNorm) -> Normal<'a> {
+        let (weight, bias) = self.split(values);
+        let SavedNorm { mean, inverse, normal } = saved;
+        kernels::moments(x, mean, inverse);
+        Normal { x, mean, inverse, weight, bias, normal }
+    }
+
+    /// Adds the gradient of the norm's input to `to`.
+    fn backward(
+        &self,
+        values: &[f32],
+        saved: &SavedNorm,
+        from: &[f32],
+        to: &mut [f32],
+        gradient: Option<&mut [f32]>,
+        scratch: &mut [Buffer<f32>; 2],
+    ) {
+        let (weight, _) = self.split(values);
+        let parameters = gradient.map(|gradient| gradient[self.range.clone()].split_at_mut(self.width));
+        let scratch = scratch.each_mut().map(|scratch| &mut scratch[..]);
+        kernels::layer_norm_gradient(from, weight, &saved.normal, &saved.inverse, to, parameters, scratch);
     }
 }
 
@@ -131,10 +156,12 @@ impl Network {
     }
 
     /// Room for the weights in the products' layout, a linear layer each, with `values` in it.
-    pub(super) fn weights(&self, values: &[f32], differentiated: bool) -> Vec<Weights> {
+    pub(super) fn weights(&self, values: &[f32], differentiated: bool, memory: &mut Memory) -> Vec<Weights> {
         let pack = |linear: &Linear| {
-            let mut weights = Weights::new(linear.format, linear.inputs, linear.outputs, differentiated);
-            weights.pack(&values[linear.weight()]);
+            let Linear { format, inputs, outputs, .. } = *linear;
+            let mut weights = Weights::new(format, inputs, outputs, differentiated, memory);
+            let values = &values[linear.weight()];
+            weights.chunks().for_each(|(first, range)| weights.pack(first, &values[range]));
             weights
         };
         self.linears().map(pack).collect()
@@ -147,42 +174,41 @@ impl Network {
         for (index, layer) in self.layers.iter().enumerate() {
             let (before, after) = trace.layers.split_at_mut(index);
             let x: &[f32] = before.last().map_or(input, |saved| &saved.result);
-            let saved = &mut after[0];
+            let [saved, after @ ..] = after else { unreachable!("one for every layer") };
             let rows = saved.rows;
             match layer {
                 Layer::Dense { linear, relu } => {
-                    saved.input.pack(&x[..linear.inputs * rows]);
-                    next_weights().apply(&saved.input, false, &mut saved.result);
+                    // The input of a later one was laid out by the ReLU before it.
+                    if index == 0 {
+                        saved.input.pack(&mut AsTheyAre { values: x, length: rows });
+                    }
+                    next_weights().apply(saved.input.right(), rows, false, &mut saved.result);
                     let bias = &values[linear.bias()];
-                    match relu {
-                        true => kernels::add_bias_relu(&mut saved.result, bias, rows),
-                        false => kernels::add_bias(&mut saved.result, bias, rows),
+                    match (relu, after.first_mut()) {
+                        (true, Some(next)) => {
+                            next.input.pack(&mut BiasRelu { values: &saved.result, bias, rows });
+                        }
+                        (true, None) => kernels::add_bias_relu(&mut saved.result, bias, rows),
+                        (false, _) => kernels::add_bias(&mut saved.result, bias, rows),
                     }
                 }
                 Layer::Block { norm, up, down } => {
-                    let (weight, bias) = norm.split(values);
-                    let hidden = &mut saved.result;
-                    kernels::layer_norm(x, weight, bias, &mut saved.normal, &mut saved.inverse, hidden);
-                    saved.input.pack(hidden);
-                    next_weights().apply(&saved.input, false, &mut saved.wide);
-                    kernels::add_bias_relu(&mut saved.wide, &values[up.bias()], rows);
-                    saved.activated.pack(&saved.wide);
-                    saved.result.copy_from_slice(x);
-                    next_weights().apply(&saved.activated, true, &mut saved.result);
-                    kernels::add_bias(&mut saved.result, &values[down.bias()], rows);
+                    saved.input.pack(&mut norm.forward(values, x, &mut saved.norm));
+                    next_weights().apply(saved.input.right(), rows, false, &mut saved.wide);
+                    let bias = &values[up.bias()];
+                    saved.activated.pack(&mut BiasRelu { values: &saved.wide, bias, rows });
+                    kernels::copy_with_bias(x, &values[down.bias()], rows, &mut saved.result);
+                    next_weights().apply(saved.activated.right(), rows, true, &mut saved.result);
                 }
                 Layer::Norm(norm) => {
-                    let (weight, bias) = norm.split(values);
-                    let Saved { normal, inverse, result, .. } = saved;
-                    kernels::layer_norm(x, weight, bias, normal, inverse, result);
+                    layout::write(&mut norm.forward(values, x, &mut saved.norm), rows, &mut saved.result);
                 }
             }
         }
-        let features: &[f32] = trace.layers.last().map_or(input, |saved| &saved.result);
-        trace.features.pack(features);
+        let features = features(&trace.layers);
         for (head, output) in self.heads.iter().zip(&mut trace.outputs) {
-            next_weights().apply(&trace.features, false, output);
-            kernels::add_bias(output, &values[head.bias()], trace.features.rows);
+            next_weights().apply(bytemuck::cast_slice(features), trace.rows, false, output);
+            kernels::add_bias(output, &values[head.bias()], trace.rows);
         }
     }
 
@@ -200,52 +226,61 @@ impl Network {
     ) {
         let mut weights = weights.iter().rev();
         let mut next_weights = || weights.next().expect("one for every linear layer");
-        let Trace { layers, features, output_gradients, head_gradients, front, back, wide, .. } = trace;
+        let Trace { layers, output_gradients, head_gradients, head_weights, front, back, wide, scratch, .. } = trace;
         let heads = self.heads.iter().zip(output_gradients).zip(head_gradients);
-        if gradient.is_some() {
-            features.transpose();
-        }
         for (index, ((head, output), operand)) in heads.rev().enumerate() {
-            operand.pack(output);
+            operand.pack(&mut AsTheyAre { values: output, length: operand.rows });
             if let Some(gradient) = gradient.as_deref_mut() {
-                linear_gradient(head, operand, output, features, gradient);
+                operand.transpose();
+                let turned = &mut head_weights[..head.inputs * head.outputs];
+                weight_gradient_transposed(operand, features(layers), turned);
+                let to = bytemuck::cast_slice_mut(&mut gradient[head.weight()]);
+                layout::transpose(bytemuck::cast_slice(turned), head.inputs, head.outputs, to, head.inputs);
+                kernels::row_sums(output, operand.rows, &mut gradient[head.bias()]);
             }
             next_weights().apply_transposed(operand, 0, index > 0, front);
         }
-        for (index, (layer, saved)) in self.layers.iter().zip(layers).enumerate().rev() {
+        for (index, layer) in self.layers.iter().enumerate().rev() {
+            let [saved, after @ ..] = &mut layers[index..] else { unreachable!("one for every layer") };
+            let rows = saved.rows;
             match layer {
                 Layer::Norm(norm) => {
                     back.fill(0.0);
-                    norm_gradient(norm, values, saved, front, back, gradient.as_deref_mut());
+                    norm.backward(values, &saved.norm, front, back, gradient.as_deref_mut(), scratch);
                     std::mem::swap(front, back);
                 }
                 Layer::Block { norm, up, down } => {
-                    let from = &front[..saved.result.len()];
-                    saved.result_gradient.pack(from);
+                    let sums = gradient.as_deref_mut().map(|gradient| &mut gradient[down.bias()]);
+                    saved.result_gradient.pack(&mut Gradient::new(front, None, rows, sums));
                     if let Some(gradient) = gradient.as_deref_mut() {
                         saved.activated.transpose();
-                        linear_gradient(down, &saved.result_gradient, from, &saved.activated, gradient);
+                        let to = &mut gradient[down.weight()];
+                        weight_gradient(&saved.result_gradient, &saved.activated, to);
                     }
                     let wide = &mut wide[..saved.wide.len()];
                     next_weights().apply_transposed(&saved.result_gradient, 0, false, wide);
-                    kernels::relu_gradient(wide, &saved.wide);
-                    saved.wide_gradient.pack(wide);
+                    let sums = gradient.as_deref_mut().map(|gradient| &mut gradient[up.bias()]);
+                    let result = Some(saved.activated.numbers());
+                    saved.wide_gradient.pack(&mut Gradient::new(wide, result, rows, sums));
                     if let Some(gradient) = gradient.as_deref_mut() {
                         saved.input.transpose();
-                        linear_gradient(up, &saved.wide_gradient, wide, &saved.input, gradient);
+                        weight_gradient(&saved.wide_gradient, &saved.input, &mut gradient[up.weight()]);
                     }
                     next_weights().apply_transposed(&saved.wide_gradient, 0, false, back);
-                    norm_gradient(norm, values, saved, back, front, gradient.as_deref_mut());
+                    norm.backward(values, &saved.norm, back, front, gradient.as_deref_mut(), scratch);
                 }
                 Layer::Dense { linear, relu } => {
-                    let front_part = &mut front[..saved.result.len()];
-                    if *relu {
-                        kernels::relu_gradient(front_part, &saved.result);
-                    }
-                    saved.result_gradient.pack(front_part);
+                    let result = match after.first() {
+                        _ if !relu => None,
+                        Some(next) => Some(next.input.numbers()),
+                        None => Some(Numbers::F32(&saved.result)),
+                    };
+                    let sums = gradient.as_deref_mut().map(|gradient| &mut gradient[linear.bias()]);
+                    saved.result_gradient.pack(&mut Gradient::new(front, result, rows, sums));
                     if let Some(gradient) = gradient.as_deref_mut() {
                         saved.input.transpose();
-                        linear_gradient(linear, &saved.result_gradient, front_part, &saved.input, gradient);
+                        let to = &mut gradient[linear.weight()];
+                        weight_gradient(&saved.result_gradient, &saved.input, to);
                     }
                     let weights = next_weights();
                     if index > 0 {
@@ -277,16 +312,16 @@ pub(super) struct Ways {
 impl Network {
     /// The products of passes over a trace and nothing else, on whatever lies there: what an update cannot do without.
     pub(super) fn multiply(&self, weights: &[Weights], trace: &mut Trace, ways: Ways, gradient: &mut [f32]) {
-        let Trace { layers, features, head_gradients, front, back, .. } = trace;
+        let Trace { layers, head_gradients, head_weights, front, back, .. } = trace;
         let mut weights = weights.iter();
         let mut pass = |linear: &Linear, x: &Operand, y: &Operand, first: Option<usize>| {
             let weights = weights.next().expect("one for every linear layer");
-            (0..ways.forward).for_each(|_| weights.apply(x, false, back));
+            (0..ways.forward).for_each(|_| weights.apply(x.right(), x.rows, false, back));
             (0..ways.weights).for_each(|_| weight_gradient(y, x, &mut gradient[linear.weight()]));
             let Some(first) = first else { return };
             (0..ways.inputs).for_each(|_| weights.apply_transposed(y, first, false, front));
         };
-        for (index, (layer, saved)) in self.layers.iter().zip(layers).enumerate() {
+        for (index, (layer, saved)) in self.layers.iter().zip(&*layers).enumerate() {
             match layer {
                 Layer::Dense { linear, .. } => {
                     let first = if index == 0 { ways.first } else { Some(0) };
@@ -299,30 +334,19 @@ impl Network {
                 Layer::Norm(_) => {}
             }
         }
-        for (head, y) in self.heads.iter().zip(head_gradients) {
-            pass(head, features, y, Some(0));
+        let x = features(layers);
+        for (y, weights) in head_gradients.iter().zip(weights) {
+            (0..ways.forward).for_each(|_| weights.apply(bytemuck::cast_slice(x), y.rows, false, back));
+            let turned = &mut head_weights[..x.len() / y.rows * y.features];
+            (0..ways.weights).for_each(|_| weight_gradient_transposed(y, x, turned));
+            (0..ways.inputs).for_each(|_| weights.apply_transposed(y, 0, false, front));
         }
     }
 }
 
-/// The gradients of a linear layer's parameters.
-fn linear_gradient(linear: &Linear, packed: &Operand, values: &[f32], x: &Operand, gradient: &mut [f32]) {
-    weight_gradient(packed, x, &mut gradient[linear.weight()]);
-    kernels::row_sums(values, packed.rows, &mut gradient[linear.bias()]);
-}
-
-/// Adds the gradient of a norm's input to `to`.
-fn norm_gradient(
-    norm: &Norm,
-    values: &[f32],
-    saved: &Saved,
-    from: &[f32],
-    to: &mut [f32],
-    gradient: Option<&mut [f32]>,
-) {
-    let (weight, _) = norm.split(values);
-    let parameters = gradient.map(|gradient| gradient[norm.range.clone()].split_at_mut(norm.width));
-    kernels::layer_norm_gradient(from, weight, &saved.normal, &saved.inverse, to, parameters);
+/// What the heads read, `[width, R]`.
+fn features(layers: &[Saved]) -> &[f32] {
+    &layers.last().expect("a body has a layer").result
 }
 
 /// What a pass through one layer leaves for the way back; buffers a layer does not need are empty.
@@ -330,20 +354,26 @@ struct Saved {
     rows: usize,
     /// What the first product reads.
     input: Operand,
-    /// A block's inner activations, as numbers and as the second product reads them.
-    wide: Aligned<f32>,
+    /// A block's inner activations, before bias and ReLU, and as the second product reads them.
+    wide: Buffer<f32>,
     activated: Operand,
-    /// A norm's normalised input, and the inverse of its standard deviation.
-    normal: Aligned<f32>,
-    inverse: Aligned<f32>,
-    result: Aligned<f32>,
+    norm: SavedNorm,
+    /// Of a layer whose ReLU's result another layer reads: before bias and ReLU.
+    result: Buffer<f32>,
     /// Gradients as the products read them.
     result_gradient: Operand,
     wide_gradient: Operand,
 }
 
+/// What a norm leaves: the input's mean, the inverse of its standard deviation, `[R]` each, and what it makes of it.
+struct SavedNorm {
+    mean: Buffer<f32>,
+    inverse: Buffer<f32>,
+    normal: Buffer<f32>,
+}
+
 impl Saved {
-    fn new(layer: &Layer, rows: usize) -> Self {
+    fn new(layer: &Layer, rows: usize, memory: &mut Memory) -> Self {
         let (inputs, width, wide, norm, format) = match layer {
             Layer::Dense { linear, .. } => (linear.inputs, linear.outputs, 0, 0, linear.format),
             Layer::Block { norm, up, .. } => (norm.width, norm.width, up.outputs, norm.width, up.format),
@@ -352,14 +382,17 @@ impl Saved {
         let packed = if matches!(layer, Layer::Norm(_)) { 0 } else { width };
         Self {
             rows,
-            input: Operand::new(format, inputs, rows),
-            wide: zeros(wide * rows),
-            activated: Operand::new(format, wide, rows),
-            normal: zeros(norm * rows),
-            inverse: zeros(if norm > 0 { rows } else { 0 }),
-            result: zeros(width * rows),
-            result_gradient: Operand::new(format, packed, rows),
-            wide_gradient: Operand::new(format, wide, rows),
+            input: Operand::new(format, inputs, rows, memory),
+            wide: memory.zeros(wide * rows),
+            activated: Operand::new(format, wide, rows, memory),
+            norm: SavedNorm {
+                mean: memory.zeros(if norm > 0 { rows } else { 0 }),
+                inverse: memory.zeros(if norm > 0 { rows } else { 0 }),
+                normal: memory.zeros(norm * rows),
+            },
+            result: memory.zeros(width * rows),
+            result_gradient: Operand::new(format, packed, rows, memory),
+            wide_gradient: Operand::new(format, wide, rows, memory),
         }
     }
 }
@@ -367,38 +400,42 @@ impl Saved {
 /// One pass over R transitions, R a multiple of [`kernels::LANES`].
 pub(super) struct Trace {
     layers: Vec<Saved>,
-    /// What the heads read.
-    features: Operand,
+    rows: usize,
     /// The heads' results, `[outputs, R]` each.
-    pub(super) outputs: Vec<Aligned<f32>>,
+    pub(super) outputs: Vec<Buffer<f32>>,
     /// Where the gradients of the loss by the heads' results go before the way back.
-    pub(super) output_gradients: Vec<Aligned<f32>>,
+    pub(super) output_gradients: Vec<Buffer<f32>>,
     head_gradients: Vec<Operand>,
+    /// The gradient of a head's weights, transposed.
+    head_weights: Buffer<f32>,
     /// The gradient on its way back: of a layer's result, and of its input.
-    front: Aligned<f32>,
-    back: Aligned<f32>,
-    wide: Aligned<f32>,
+    front: Buffer<f32>,
+    back: Buffer<f32>,
+    wide: Buffer<f32>,
+    /// `[R]` each.
+    scratch: [Buffer<f32>; 2],
 }
 
 impl Trace {
-    pub(super) fn new(network: &Network, rows: usize) -> Self {
-        let layers: Vec<Saved> = network.layers.iter().map(|layer| Saved::new(layer, rows)).collect();
+    pub(super) fn new(network: &Network, rows: usize, memory: &mut Memory) -> Self {
+        let layers: Vec<Saved> = network.layers.iter().map(|layer| Saved::new(layer, rows, memory)).collect();
         let results = layers.iter().map(|saved| saved.result.len()).max().unwrap_or(0);
         let wide = layers.iter().map(|saved| saved.wide.len()).max().unwrap_or(0);
         let widest = results.max(network.width * rows).max(network.inputs * rows).max(wide);
-        let outputs = || network.heads.iter().map(|head| zeros(head.outputs * rows)).collect();
+        let head_weights = network.heads.iter().map(|head| head.inputs * head.outputs).max().unwrap_or(0);
+        let heads = || network.heads.iter().map(|head| head.outputs);
         Self {
-            features: Operand::new(Format::F32, network.width, rows),
-            outputs: outputs(),
-            output_gradients: outputs(),
-            head_gradients: network
-                .heads
-                .iter()
-                .map(|head| Operand::new(Format::F32, head.outputs, rows))
+            rows,
+            outputs: heads().map(|outputs| memory.zeros(outputs * rows)).collect(),
+            output_gradients: heads().map(|outputs| memory.zeros(outputs * rows)).collect(),
+            head_gradients: heads()
+                .map(|outputs| Operand::new(Format::F32, outputs, rows, memory))
                 .collect(),
-            front: zeros(widest),
-            back: zeros(widest),
-            wide: zeros(wide),
+            head_weights: memory.zeros(head_weights),
+            front: memory.zeros(widest),
+            back: memory.zeros(widest),
+            wide: memory.zeros(wide),
+            scratch: [memory.zeros(rows), memory.zeros(rows)],
             layers,
         }
     }

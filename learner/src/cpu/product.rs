@@ -9,22 +9,8 @@
 //! | pairs | rows f and f + 1 interleaved | right factor, summed over F |
 //! | columns | the transposed plain words | right factor `Xᵀ`, summed over R |
 
-use aligned_vec::{AVec, ConstAlign};
-
-use super::layout;
-
-/// Bytes of a cache line and of the widest vector.
-const ALIGNMENT: usize = 64;
-
-/// Numbers in memory aligned for the widest vectors.
-pub(super) type Aligned<T> = AVec<T, ConstAlign<ALIGNMENT>>;
-
-/// `length` zeros.
-pub(super) fn zeros<T: Default + Clone>(length: usize) -> Aligned<T> {
-    let mut values = AVec::new(ALIGNMENT);
-    values.resize(length, T::default());
-    values
-}
+use super::layout::{self, AsTheyAre, Layout, Rows};
+use super::memory::{Buffer, Memory};
 
 /// What the numbers of a product's operands are; its result is float32.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -41,6 +27,15 @@ impl Format {
         match self {
             Self::F32 => 1,
             Self::Bf16 => 2,
+        }
+    }
+
+    /// The longest sides, `[m, n, k]`, of the blocks that a product is made of: two operands and a result that fit into
+    /// a core's second cache. Found by measuring 2×1024 on a Xeon with AMX.
+    fn block(self) -> [usize; 3] {
+        match self {
+            Self::F32 => [256; 3],
+            Self::Bf16 => [512; 3],
         }
     }
 
@@ -124,6 +119,28 @@ impl Product {
         }
         let per_word = format.per_word();
         assert!(k % per_word == 0 && lda % per_word == 0 && k <= lda && n <= ldb && n <= ldc, "{self:?}");
+        let [rows, columns, terms] = format.block();
+        let blocks = |side: usize, longest: usize| {
+            (0..side).step_by(longest).map(move |first| (first, longest.min(side - first)))
+        };
+        blocks(k, terms).all(|(k, terms)| {
+            blocks(n, columns).all(|(n, columns)| {
+                blocks(m, rows).all(|(m, rows)| {
+                    let block = Self {
+                        size: Size { m: rows, n: columns, k: terms },
+                        accumulate: accumulate || k > 0,
+                        ..*self
+                    };
+                    let a = &a[(m * lda + k) / per_word..];
+                    block.run_block(a, &b[k / per_word * ldb + n..], &mut c[m * ldc + n..])
+                })
+            })
+        })
+    }
+
+    fn run_block(&self, a: &[u32], b: &[u32], c: &mut [f32]) -> bool {
+        let Self { format, size: Size { m, n, k }, lda, ldb, ldc, accumulate } = *self;
+        let per_word = format.per_word();
         assert!(a.len() >= ((m - 1) * lda + k) / per_word, "left factor of {} words: {self:?}", a.len());
         assert!(b.len() >= (k / per_word - 1) * ldb + n, "right factor of {} words: {self:?}", b.len());
         assert!(c.len() >= (m - 1) * ldc + n, "result of {} numbers: {self:?}", c.len());
@@ -140,50 +157,77 @@ impl Product {
 
 /// An activation or its gradient, `[F, R]`, laid out for products. R is even.
 pub(super) struct Operand {
-    pub(super) format: Format,
+    format: Format,
     pub(super) features: usize,
     pub(super) rows: usize,
-    pub(super) plain: Aligned<u32>,
-    pub(super) pairs: Aligned<u32>,
-    pub(super) columns: Aligned<u32>,
+    plain: Buffer<u32>,
+    /// Empty where a word is one number: pairs are plain then.
+    pairs: Buffer<u32>,
+    columns: Buffer<u32>,
 }
 
 impl Operand {
-    pub(super) fn new(format: Format, features: usize, rows: usize) -> Self {
+    pub(super) fn new(format: Format, features: usize, rows: usize, memory: &mut Memory) -> Self {
         let length = format.padded(features) * rows / format.per_word();
-        let [plain, pairs, columns] = std::array::from_fn(|_| zeros(length));
+        let pairs = if format == Format::F32 { 0 } else { length };
+        let [plain, pairs, columns] = [length, pairs, length].map(|length| memory.zeros(length));
         Self { format, features, rows, plain, pairs, columns }
     }
 
-    /// Rounds `values`, `[F, R]`, into the plain and the paired layout.
-    pub(super) fn pack(&mut self, values: &[f32]) {
-        let layout = layout::Layout { length: self.rows, stride: self.rows };
-        pack(self.format, values, layout, &mut self.plain, &mut self.pairs);
+    /// Rounds `rows`, `[F, R]`, into the plain and the paired layout.
+    pub(super) fn pack(&mut self, rows: &mut impl Rows) {
+        let layout = Layout { length: self.rows, stride: self.rows };
+        pack(self.format, rows, self.features, layout, &mut self.plain, &mut self.pairs);
     }
 
-    /// Brings the columns up to date with the plain layout: for the gradient of the weights that read this.
+    /// The numbers in the plain layout.
+    pub(super) fn numbers(&self) -> Numbers<'_> {
+        match self.format {
+            Format::F32 => Numbers::F32(bytemuck::cast_slice(&self.plain)),
+            Format::Bf16 => Numbers::Bf16(bytemuck::cast_slice(&self.plain)),
+        }
+    }
+
+    /// Brings the columns up to date with the plain layout: for the gradient of weights.
     pub(super) fn transpose(&mut self) {
         let (features, words) = (self.format.padded(self.features), self.rows / self.format.per_word());
-        layout::transpose(&self.plain, features, words, &mut self.columns);
+        layout::transpose(&self.plain, features, words, &mut self.columns, features);
+    }
+
+    /// As the right factor of a product, summed over F.
+    pub(super) fn right(&self) -> &[u32] {
+        if self.pairs.is_empty() { &self.plain } else { &self.pairs }
     }
 
     /// Width of a row of columns, in words.
-    pub(super) fn column_stride(&self) -> usize {
+    fn column_stride(&self) -> usize {
         self.format.padded(self.features)
     }
 }
 
-/// Rounds a matrix into the plain layout (rows of `layout.stride` numbers) and, where there is room, into pairs.
-fn pack(format: Format, values: &[f32], layout: layout::Layout, plain: &mut [u32], pairs: &mut [u32]) {
+/// Numbers as a product reads them.
+#[derive(Clone, Copy)]
+pub(super) enum Numbers<'a> {
+    F32(&'a [f32]),
+    /// The bits of bfloat16.
+    Bf16(&'a [u16]),
+}
+
+/// Rounds `count` rows into the plain layout (rows of `layout.stride` numbers) and, where there is room, into pairs.
+fn pack(
+    format: Format,
+    rows: &mut impl Rows,
+    count: usize,
+    layout: Layout,
+    plain: &mut [u32],
+    pairs: &mut [u32],
+) {
     match format {
         Format::F32 => {
-            let words = bytemuck::cast_slice(values);
-            plain[..words.len()].copy_from_slice(words);
-            if !pairs.is_empty() {
-                pairs[..words.len()].copy_from_slice(words);
-            }
+            let plain = &mut plain[..count * layout.length];
+            layout::write(rows, layout.length, bytemuck::cast_slice_mut(plain));
         }
-        Format::Bf16 => layout::pack_bf16(values, layout, bytemuck::cast_slice_mut(plain), pairs),
+        Format::Bf16 => layout::pack_bf16(rows, count, layout, bytemuck::cast_slice_mut(plain), pairs),
     }
 }
 
@@ -193,43 +237,68 @@ pub(super) struct Weights {
     inputs: usize,
     outputs: usize,
     /// `[outputs, inputs]`: the left factor of the layer.
-    plain: Aligned<u32>,
+    plain: Buffer<u32>,
     /// Transposed, `[inputs, outputs]`: the left factor of its gradient. Empty where no gradient is asked for.
-    transposed: Aligned<u32>,
-    /// Scratch for the way there.
-    pairs: Aligned<u32>,
+    transposed: Buffer<u32>,
+    /// Scratch for the way there, where a word is not one number: [`Weights::CHUNK`] outputs.
+    pairs: Buffer<u32>,
 }
 
 impl Weights {
-    pub(super) fn new(format: Format, inputs: usize, outputs: usize, differentiated: bool) -> Self {
+    pub(super) fn new(
+        format: Format,
+        inputs: usize,
+        outputs: usize,
+        differentiated: bool,
+        memory: &mut Memory,
+    ) -> Self {
         let per_word = format.per_word();
         let turned = if differentiated { inputs * format.padded(outputs) / per_word } else { 0 };
         Self {
             format,
             inputs,
             outputs,
-            plain: zeros(outputs.next_multiple_of(2) * format.padded(inputs) / per_word),
-            transposed: zeros(turned),
-            pairs: zeros(if differentiated { format.padded(outputs) / per_word * inputs } else { 0 }),
+            plain: memory.zeros(outputs.next_multiple_of(2) * format.padded(inputs) / per_word),
+            transposed: memory.zeros(turned),
+            pairs: memory.zeros(match format {
+                Format::Bf16 if differentiated => Self::CHUNK / 2 * inputs,
+                _ => 0,
+            }),
         }
     }
 
-    /// Takes new values, row-major.
-    pub(super) fn pack(&mut self, values: &[f32]) {
-        let layout = layout::Layout { length: self.inputs, stride: self.format.padded(self.inputs) };
-        pack(self.format, values, layout, &mut self.plain, &mut self.pairs);
+    /// Outputs that are packed at a time: whole blocks of the transposition.
+    pub(super) const CHUNK: usize = 32;
+
+    /// Takes new values of the outputs from `first` on, a multiple of [`Weights::CHUNK`], and at most so many; row-major.
+    pub(super) fn pack(&mut self, first: usize, values: &[f32]) {
+        let Self { format, inputs, outputs, .. } = *self;
+        let (per_word, count) = (format.per_word(), values.len() / inputs);
+        let layout = Layout { length: inputs, stride: format.padded(inputs) };
+        let plain = &mut self.plain[first * layout.stride / per_word..];
+        pack(format, &mut AsTheyAre { values, length: inputs }, count, layout, plain, &mut self.pairs);
         if !self.transposed.is_empty() {
-            let words = self.format.padded(self.outputs) / self.format.per_word();
-            layout::transpose(&self.pairs, words, self.inputs, &mut self.transposed);
+            let pairs = if self.pairs.is_empty() { &*plain } else { &self.pairs };
+            let (words, stride) = (format.padded(count) / per_word, format.padded(outputs) / per_word);
+            layout::transpose(pairs, words, inputs, &mut self.transposed[first / per_word..], stride);
         }
     }
 
-    /// `to = W·x` or `to += W·x`, `[outputs, R]`.
-    pub(super) fn apply(&self, x: &Operand, accumulate: bool, to: &mut [f32]) {
+    /// Runs of outputs that [`Weights::pack`] takes: their first, and where their values lie.
+    pub(super) fn chunks(&self) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> + use<> {
+        let (inputs, outputs) = (self.inputs, self.outputs);
+        (0..outputs).step_by(Self::CHUNK).map(move |first| {
+            let end = outputs.min(first + Self::CHUNK);
+            (first, first * inputs..end * inputs)
+        })
+    }
+
+    /// `to = W·x` or `to += W·x`, `[outputs, R]`; `x` is a right factor, `[inputs, R]`.
+    pub(super) fn apply(&self, x: &[u32], rows: usize, accumulate: bool, to: &mut [f32]) {
         let k = self.format.padded(self.inputs);
-        let size = Size { m: self.outputs, n: x.rows, k };
-        let product = Product { format: self.format, size, lda: k, ldb: x.rows, ldc: x.rows, accumulate };
-        product.run(&self.plain, &x.pairs, to);
+        let size = Size { m: self.outputs, n: rows, k };
+        let product = Product { format: self.format, size, lda: k, ldb: rows, ldc: rows, accumulate };
+        product.run(&self.plain, x, to);
     }
 
     /// `to = Wᵀ·gradient`, for the inputs from `first` on: `[inputs − first, R]`.
@@ -244,12 +313,12 @@ impl Weights {
         let (m, n) = (self.inputs - first, gradient.rows);
         let product =
             Product { format: self.format, size: Size { m, n, k }, lda: k, ldb: n, ldc: n, accumulate };
-        product.run(&self.transposed[first * k / self.format.per_word()..], &gradient.pairs, to);
+        product.run(&self.transposed[first * k / self.format.per_word()..], gradient.right(), to);
     }
 }
 
-/// The gradient of the weights between `x` and a result of the given gradient: `to = gradient·xᵀ`,
-/// `[outputs, inputs]`.
+/// The gradient of the weights between `x` (whose columns are up to date) and a result of the given gradient:
+/// `to = gradient·xᵀ`, `[outputs, inputs]`.
 pub(super) fn weight_gradient(gradient: &Operand, x: &Operand, to: &mut [f32]) {
     let size = Size { m: gradient.features, n: x.features, k: gradient.rows };
     let product = Product {
@@ -261,4 +330,14 @@ pub(super) fn weight_gradient(gradient: &Operand, x: &Operand, to: &mut [f32]) {
         accumulate: false,
     };
     product.run(&gradient.plain, &x.columns, to);
+}
+
+/// The same the other way around, `to = x·gradientᵀ`, `[inputs, outputs]`, in float32, for few outputs: the columns of
+/// their gradient are cheaper than those of `x`, `[inputs, R]`.
+pub(super) fn weight_gradient_transposed(gradient: &Operand, x: &[f32], to: &mut [f32]) {
+    let (outputs, rows) = (gradient.features, gradient.rows);
+    let size = Size { m: x.len() / rows, n: outputs, k: rows };
+    let product =
+        Product { format: Format::F32, size, lda: rows, ldb: outputs, ldc: outputs, accumulate: false };
+    product.run(bytemuck::cast_slice(x), &gradient.columns, to);
 }

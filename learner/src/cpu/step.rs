@@ -1,6 +1,8 @@
 //! One pass over a network's parameters: the sum of the workers' gradients, AdamW, Polyak, and the layout of the new
 //! weights, in pieces that threads share.
 
+use std::ops::Range;
+
 use super::kernels::{self, AdamStep};
 use super::network::Network;
 use super::product::Weights;
@@ -61,20 +63,35 @@ pub(super) fn cut<'a>(
 }
 
 impl Piece<'_> {
-    /// A step of AdamW, then of Polyak averaging for the target.
+    /// A step of AdamW, then of Polyak averaging for the target, and the layout of what came of it: all of it for a few
+    /// outputs at a time, which stay in the cache meanwhile.
     pub(super) fn step(&mut self, step: AdamStep, tau: f32) {
-        let (sum, others) = self.gradients.split_first_mut().expect("a worker at least");
-        others.iter().for_each(|gradient| kernels::add(sum, gradient));
-        let Flat { values, first, second } = &mut self.flat;
-        kernels::adam(step, values, sum, first, second);
-        if let Some(target) = &mut self.target {
-            kernels::polyak(target, values, tau);
-        }
-        if let Some((count, weights, target_weights)) = &mut self.weights {
-            weights.pack(&values[..*count]);
+        let length = self.flat.values.len();
+        let chunks: Vec<_> = match &self.weights {
+            Some((_, weights, _)) => weights.chunks().collect(),
+            None => vec![],
+        };
+        for (first, range) in chunks {
+            self.step_range(range.clone(), step, tau);
+            let Some((_, weights, target_weights)) = &mut self.weights else { continue };
+            weights.pack(first, &self.flat.values[range.clone()]);
             if let (Some(weights), Some(target)) = (target_weights, &self.target) {
-                weights.pack(&target[..*count]);
+                weights.pack(first, &target[range]);
             }
+        }
+        let weights = self.weights.as_ref().map_or(0, |(count, ..)| *count);
+        self.step_range(weights..length, step, tau);
+    }
+
+    fn step_range(&mut self, range: Range<usize>, step: AdamStep, tau: f32) {
+        let (sum, others) = self.gradients.split_first_mut().expect("a worker at least");
+        let sum = &mut sum[range.clone()];
+        others.iter().for_each(|gradient| kernels::add(sum, &gradient[range.clone()]));
+        let Flat { values, first, second } = &mut self.flat;
+        let values = &mut values[range.clone()];
+        kernels::adam(step, values, sum, &mut first[range.clone()], &mut second[range.clone()]);
+        if let Some(target) = &mut self.target {
+            kernels::polyak(&mut target[range], values, tau);
         }
     }
 }

@@ -4,7 +4,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::Device;
 
-use super::layout;
+use super::layout::{self, AsTheyAre};
+use super::memory::Memory;
 use super::product::{Format, Operand, Product, Size};
 use crate::config::{NetworkKind, Precision, SacConfig};
 use crate::parameters::to_vec;
@@ -136,39 +137,48 @@ fn the_same_minibatches_give_the_same_bits_on_the_same_number_of_threads() {
     }
 }
 
+/// A number as bfloat16 holds it.
+fn round(value: f32) -> f32 {
+    f32::from_bits((value.to_bits() + 0x7fff + ((value.to_bits() >> 16) & 1)) & 0xffff_0000)
+}
+
 #[test]
-fn a_product_in_bfloat16_is_that_of_the_rounded_numbers() {
-    if !Format::Bf16.works() {
-        eprintln!("skipped: libtorch has no such product for this processor");
-        return;
-    }
+fn a_product_is_that_of_the_rounded_numbers_in_one_block_and_in_many() {
     let mut rng = ChaCha8Rng::seed_from_u64(3);
-    let (m, n, k) = (5, 16, 7);
-    let (a, b) = (random(m * k, -1.0, 1.0, &mut rng), random(k * n, -1.0, 1.0, &mut rng));
-    let round =
-        |value: f32| f32::from_bits((value.to_bits() + 0x7fff + ((value.to_bits() >> 16) & 1)) & 0xffff_0000);
-    let mut right = Operand::new(Format::Bf16, k, n);
-    right.pack(&b);
-    let mut left = vec![0u32; m * 4];
-    for row in 0..m {
-        for column in 0..k {
-            left[row * 4 + column / 2] |= (round(a[row * k + column]).to_bits() >> 16) << (16 * (column % 2));
+    for format in [Format::F32, Format::Bf16] {
+        if !format.works() {
+            eprintln!("skipped: libtorch has no product in {format:?} for this processor");
+            continue;
         }
-    }
-    let mut result = vec![0.0; m * n];
-    let product = Product {
-        format: Format::Bf16,
-        size: Size { m, n, k: 8 },
-        lda: 8,
-        ldb: n,
-        ldc: n,
-        accumulate: false,
-    };
-    product.run(&left, &right.pairs, &mut result);
-    for row in 0..m {
-        for column in 0..n {
-            let exact: f32 = (0..k).map(|i| round(a[row * k + i]) * round(b[i * n + column])).sum();
-            assert!((result[row * n + column] - exact).abs() < 1e-5, "[{row}, {column}]");
+        let rounded = |value: f32| if format == Format::Bf16 { round(value) } else { value };
+        for (m, n, k) in [(5, 16, 7), (600, 48, 31), (7, 528, 600), (70, 32, 1100)] {
+            let (a, b) = (random(m * k, -1.0, 1.0, &mut rng), random(k * n, -1.0, 1.0, &mut rng));
+            let mut right = Operand::new(format, k, n, &mut Memory::default());
+            right.pack(&mut AsTheyAre { values: &b, length: n });
+            let padded = format.padded(k);
+            let mut left = vec![0u32; m * padded / format.per_word()];
+            for (row, a) in a.chunks_exact(k).enumerate() {
+                for (column, value) in a.iter().enumerate() {
+                    let place = row * padded + column;
+                    left[place / format.per_word()] |= match format {
+                        Format::F32 => value.to_bits(),
+                        Format::Bf16 => (round(*value).to_bits() >> 16) << (16 * (column % 2)),
+                    };
+                }
+            }
+            let size = Size { m, n, k: padded };
+            let mut result = vec![1.0; m * n];
+            for accumulate in [false, true] {
+                Product { format, size, lda: padded, ldb: n, ldc: n, accumulate }
+                    .run(&left, right.right(), &mut result);
+            }
+            for row in 0..m {
+                for column in 0..n {
+                    let term = |i: usize| f64::from(rounded(a[row * k + i])) * f64::from(rounded(b[i * n + column]));
+                    let error = f64::from(result[row * n + column]) - 2.0 * (0..k).map(term).sum::<f64>();
+                    assert!(error.abs() < 1e-3, "{format:?}, {m} × {n} × {k}: {error} at [{row}, {column}]");
+                }
+            }
         }
     }
 }
@@ -177,43 +187,49 @@ fn a_product_in_bfloat16_is_that_of_the_rounded_numbers() {
 fn words_are_transposed_whatever_the_sides() {
     for (rows, columns) in [(1, 1), (16, 16), (3, 40), (40, 3), (33, 50), (128, 64)] {
         let words: Vec<u32> = (0..rows * columns).collect();
-        let mut turned = vec![0; words.len()];
         let (rows, columns) = (rows as usize, columns as usize);
-        layout::transpose(&words, rows, columns, &mut turned);
-        for row in 0..rows {
-            for column in 0..columns {
-                assert_eq!(turned[column * rows + row], words[row * columns + column], "{rows} × {columns}");
+        for stride in [rows, rows + 5] {
+            let (mut turned, mut plainly) = (vec![7; stride * columns], vec![7; stride * columns]);
+            layout::transpose(&words, rows, columns, &mut turned, stride);
+            layout::transpose_by_words(&words, columns, &mut plainly, stride, 0..rows, 0..columns);
+            assert_eq!(turned, plainly, "{rows} × {columns}");
+            for (place, word) in turned.iter().enumerate() {
+                let (column, row) = (place / stride, place % stride);
+                let wanted = if row < rows { words[row * columns + column] } else { 7 };
+                assert_eq!(*word, wanted, "{rows} × {columns}");
             }
         }
     }
 }
 
 #[test]
-fn what_is_packed_and_transposed_without_avx512_is_the_same() {
+fn rows_are_packed_to_the_nearest_number_and_in_pairs_whatever_the_sides() {
     let mut rng = ChaCha8Rng::seed_from_u64(4);
     for (rows, columns) in [(2, 16), (3, 40), (7, 33), (1, 5)] {
         let mut values = random(rows * columns, -3.0, 3.0, &mut rng);
         values[0] = f32::INFINITY;
         values[columns - 1] = 1.0 + 2.0f32.powi(-9); // Halfway between two numbers of bfloat16.
-        let rows_of = layout::Layout { length: columns, stride: columns };
-        let (mut plain, mut pairs) =
-            (vec![0u16; (rows + 1) * columns], vec![0u32; rows.div_ceil(2) * columns]);
-        layout::pack_bf16(&values, rows_of, &mut plain, &mut pairs);
-        let bf16 = |value: f32| {
-            let bits = value.to_bits();
-            ((bits + 0x7fff + ((bits >> 16) & 1)) >> 16) as u16
-        };
+        let stride = columns + 3;
+        let (mut plain, mut pairs) = (vec![7u16; rows * stride], vec![0u32; rows.div_ceil(2) * columns]);
+        let layout = layout::Layout { length: columns, stride };
+        let mut source = AsTheyAre { values: &values, length: columns };
+        layout::pack_bf16(&mut source, rows, layout, &mut plain, &mut pairs);
         for (index, value) in values.iter().enumerate() {
-            assert_eq!(plain[index], bf16(*value), "{value}");
             let (row, column) = (index / columns, index % columns);
-            let pair = pairs[row / 2 * columns + column];
-            assert_eq!((pair >> (16 * (row % 2))) as u16, plain[index]);
+            let packed = plain[row * stride + column];
+            let wanted = if value.is_finite() { round(*value) } else { *value };
+            assert_eq!(f32::from_bits(u32::from(packed) << 16), wanted);
+            assert_eq!((pairs[row / 2 * columns + column] >> (16 * (row % 2))) as u16, packed);
+            if row + 1 == rows && row % 2 == 0 {
+                assert_eq!(pairs[row / 2 * columns + column] >> 16, 0);
+            }
         }
-        let words: Vec<u32> = values.iter().map(|value| value.to_bits()).collect();
-        let (mut fast, mut plain) = (vec![0; words.len()], vec![0; words.len()]);
-        layout::transpose(&words, rows, columns, &mut fast);
-        layout::transpose_by_words(&words, rows, columns, &mut plain, 0..rows, 0..columns);
-        assert_eq!(fast, plain);
+        for row in plain.chunks_exact(stride) {
+            assert_eq!(row[columns..], [7; 3]);
+        }
+        let mut written = vec![0.0; values.len()];
+        layout::write(&mut source, columns, &mut written);
+        assert_eq!(written, values);
     }
 }
 

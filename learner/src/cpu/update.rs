@@ -9,7 +9,8 @@ use rayon::prelude::*;
 use super::kernels::{self, AdamStep, LANES, Motor};
 use super::layout;
 use super::network::{Network, Trace, Ways};
-use super::product::{Aligned, Format, Weights, zeros};
+use super::memory::{Buffer, Memory};
+use super::product::{Format, Weights};
 use super::step::{Flat, cut, take};
 use crate::sac::Batch;
 
@@ -74,8 +75,11 @@ impl CpuUpdate {
         }
         let actor_network = Network::new(&shape.body, shape.observation, &[shape.action; 2], format);
         let critic = Network::new(critic, shape.observation + shape.action, &[1], format);
-        let lay_out = |values: &[f32], differentiated| {
-            values.chunks_exact(critic.length).map(|one| critic.weights(one, differentiated)).collect()
+        let mut memory = Memory::default();
+        let actor_weights = actor_network.weights(values.actor, true, &mut memory);
+        let mut lay_out = |values: &[f32], differentiated| {
+            let networks = values.chunks_exact(critic.length);
+            networks.map(|one| critic.weights(one, differentiated, &mut memory)).collect()
         };
         let pool = (threads > 1).then(|| {
             let name = |index| format!("update-{index}");
@@ -84,7 +88,7 @@ impl CpuUpdate {
         Some(Self {
             threads: if matches!(pool, Some(Some(_))) { threads } else { 1 },
             pool: pool.flatten(),
-            actor_weights: actor_network.weights(values.actor, true),
+            actor_weights,
             critic_weights: lay_out(values.critics, true),
             target_weights: lay_out(values.targets, false),
             actor: actor_network,
@@ -193,10 +197,12 @@ impl CpuUpdate {
         self.batch = batch;
         let share = batch.div_ceil(self.threads).next_multiple_of(LANES);
         let critics = self.critic_weights.len();
-        self.workers = (0..batch)
-            .step_by(share)
-            .map(|first| Worker::new(first..batch.min(first + share), &self.actor, &self.critic, critics))
-            .collect();
+        let mut memory = Memory::default();
+        let mut worker = |first: usize| {
+            let rows = first..batch.min(first + share);
+            Worker::new(rows, &self.actor, &self.critic, critics, &mut memory)
+        };
+        self.workers = (0..batch).step_by(share).map(&mut worker).collect();
     }
 }
 
@@ -231,51 +237,57 @@ struct Worker {
     /// R: their number, padded.
     padded: usize,
     /// `[observation + action, R]`: (s, a) of the minibatch, then (s, a ~ π(s)).
-    now: Aligned<f32>,
+    now: Buffer<f32>,
     /// `[observation + action, R]`: (s', a' ~ π(s')).
-    next: Aligned<f32>,
+    next: Buffer<f32>,
     /// `[action, R]`.
-    noise: Aligned<f32>,
+    noise: Buffer<f32>,
     /// `[R]` each.
-    beta: Aligned<f32>,
-    log_prob: Aligned<f32>,
-    value: Aligned<f32>,
+    beta: Buffer<f32>,
+    log_prob: Buffer<f32>,
+    value: Buffer<f32>,
     /// Transitions whose smallest Q a critic has answered for.
     taken: Vec<bool>,
-    share: Aligned<f32>,
+    share: Buffer<f32>,
     /// `[action, R]`: the gradient of the actor's loss by the actions, as far as it goes through the critics.
-    action_gradient: Aligned<f32>,
+    action_gradient: Buffer<f32>,
     /// Rows as they come, padded.
-    staging: Aligned<f32>,
+    staging: Buffer<f32>,
     actor: Trace,
     critics: Vec<Trace>,
-    actor_gradient: Aligned<f32>,
-    critics_gradient: Aligned<f32>,
+    actor_gradient: Buffer<f32>,
+    critics_gradient: Buffer<f32>,
     /// |Q − y| of each transition, mean over the critics.
     td_errors: Vec<f32>,
     phase: Phase,
 }
 
 impl Worker {
-    fn new(rows: Range<usize>, actor: &Network, critic: &Network, critics: usize) -> Self {
+    fn new(
+        rows: Range<usize>,
+        actor: &Network,
+        critic: &Network,
+        critics: usize,
+        memory: &mut Memory,
+    ) -> Self {
         let padded = rows.len().next_multiple_of(LANES);
         let action = critic.inputs - actor.inputs;
         Self {
             padded,
-            now: zeros(critic.inputs * padded),
-            next: zeros(critic.inputs * padded),
-            noise: zeros(action * padded),
-            beta: zeros(padded),
-            log_prob: zeros(padded),
-            value: zeros(padded),
+            now: memory.zeros(critic.inputs * padded),
+            next: memory.zeros(critic.inputs * padded),
+            noise: memory.zeros(action * padded),
+            beta: memory.zeros(padded),
+            log_prob: memory.zeros(padded),
+            value: memory.zeros(padded),
             taken: vec![false; rows.len()],
-            share: zeros(padded),
-            action_gradient: zeros(action * padded),
-            staging: zeros(critic.inputs * padded),
-            actor: Trace::new(actor, padded),
-            critics: (0..critics).map(|_| Trace::new(critic, padded)).collect(),
-            actor_gradient: zeros(actor.length),
-            critics_gradient: zeros(critics * critic.length),
+            share: memory.zeros(padded),
+            action_gradient: memory.zeros(action * padded),
+            staging: memory.zeros(critic.inputs * padded),
+            actor: Trace::new(actor, padded, memory),
+            critics: (0..critics).map(|_| Trace::new(critic, padded, memory)).collect(),
+            actor_gradient: memory.zeros(actor.length),
+            critics_gradient: memory.zeros(critics * critic.length),
             td_errors: vec![0.0; rows.len()],
             phase: Phase::default(),
             rows,
@@ -292,7 +304,7 @@ impl Worker {
             staging[..rows.len() * width].copy_from_slice(&from[rows.start * width..rows.end * width]);
             staging[rows.len() * width..padded * width].fill(0.0);
             let words: &[u32] = bytemuck::cast_slice(&staging[..padded * width]);
-            layout::transpose(words, padded, width, bytemuck::cast_slice_mut(to));
+            layout::transpose(words, padded, width, bytemuck::cast_slice_mut(to), padded);
         };
         load(&batch.observation, observation, &mut self.now[..split]);
         load(&batch.action, action, &mut self.now[split..]);
@@ -346,7 +358,7 @@ impl Worker {
         self.staging[..noise.len()].copy_from_slice(noise);
         self.staging[noise.len()..action * padded].fill(0.0);
         let words: &[u32] = bytemuck::cast_slice(&self.staging[..action * padded]);
-        layout::transpose(words, padded, action, bytemuck::cast_slice_mut(&mut self.noise));
+        layout::transpose(words, padded, action, bytemuck::cast_slice_mut(&mut self.noise), padded);
 
         let (observations, actions) = self.now.split_at_mut(split);
         actor.forward(networks.values.actor, networks.actor_weights, observations, &mut self.actor);
@@ -396,7 +408,7 @@ impl Worker {
 }
 
 fn motor<'a>(
-    outputs: &'a [Aligned<f32>],
+    outputs: &'a [Buffer<f32>],
     noise: &'a [f32],
     beta: &'a [f32],
     part: Range<usize>,
