@@ -116,10 +116,15 @@ impl Rows for Gradient<'_> {
     }
 }
 
-/// Whole lanes of a matrix whose rows are whole lanes.
+/// `N` numbers of a matrix whose rows are whole lanes.
+#[inline(always)]
+fn part<T, const N: usize>(values: &[T], start: usize) -> &[T; N] {
+    values[start..].first_chunk().expect("rows are whole lanes")
+}
+
 #[inline(always)]
 fn lanes<T: Copy>(values: &[T], start: usize) -> [T; LANES] {
-    *values[start..].first_chunk().expect("rows are whole lanes")
+    *part(values, start)
 }
 
 /// The sum of every row: the gradient of a bias.
@@ -189,7 +194,7 @@ impl Rows for Normal<'_> {
 }
 
 /// Adds the gradient of a layer norm's input to `to`, given that of its result. `parameters` receives the gradients
-/// of weight and bias, where they are asked for; `scratch` is `[R]` each.
+/// of weight and bias, where they are asked for.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 pub(super) fn layer_norm_gradient(
     gradient: &[f32],
@@ -197,40 +202,64 @@ pub(super) fn layer_norm_gradient(
     normal: &[f32],
     inverse: &[f32],
     to: &mut [f32],
-    mut parameters: Option<(&mut [f32], &mut [f32])>,
-    scratch: [&mut [f32]; 2],
+    parameters: Option<(&mut [f32], &mut [f32])>,
 ) {
+    /// A few vectors side by side, so that one sum need not wait for another.
+    const WIDE: usize = 4 * LANES;
     let rows = inverse.len();
-    let scale = 1.0 / weight.len() as f32;
-    let [sums, products] = scratch.map(|scratch| &mut scratch[..rows]);
-    sums.fill(0.0);
-    products.fill(0.0);
-    let matrices = || gradient.chunks_exact(rows).zip(normal.chunks_exact(rows)).zip(weight);
-    for (row, ((gradient, normal), weight)) in matrices().enumerate() {
-        let (mut by_weight, mut by_bias) = ([0.0f32; LANES], [0.0f32; LANES]);
-        let lanes = gradient.chunks_exact(LANES).zip(normal.chunks_exact(LANES));
-        let scratch = sums.chunks_exact_mut(LANES).zip(products.chunks_exact_mut(LANES));
-        for ((gradient, normal), (sums, products)) in lanes.zip(scratch) {
+    let wide = rows - rows % WIDE;
+    for start in (0..wide).step_by(WIDE) {
+        input_gradient::<WIDE>(gradient, weight, normal, inverse, to, start);
+    }
+    for start in (wide..rows).step_by(LANES) {
+        input_gradient::<LANES>(gradient, weight, normal, inverse, to, start);
+    }
+    let Some((weights, biases)) = parameters else { return };
+    for row in 0..weight.len() {
+        let (mut weight, mut bias) = ([0.0f32; LANES], [0.0f32; LANES]);
+        let (gradient, normal) = (&gradient[row * rows..][..rows], &normal[row * rows..][..rows]);
+        for (gradient, normal) in gradient.chunks_exact(LANES).zip(normal.chunks_exact(LANES)) {
             (0..LANES).for_each(|lane| {
-                let product = gradient[lane] * normal[lane];
-                by_weight[lane] += product;
-                by_bias[lane] += gradient[lane];
-                sums[lane] += gradient[lane] * weight;
-                products[lane] += product * weight;
+                weight[lane] += gradient[lane] * normal[lane];
+                bias[lane] += gradient[lane];
             });
         }
-        if let Some((weights, biases)) = &mut parameters {
-            weights[row] = total(&by_weight);
-            biases[row] = total(&by_bias);
+        weights[row] = total(&weight);
+        biases[row] = total(&bias);
+    }
+}
+
+/// [`layer_norm_gradient`] by the input, for `N` transitions from `start` on.
+#[inline(always)]
+fn input_gradient<const N: usize>(
+    gradient: &[f32],
+    weight: &[f32],
+    normal: &[f32],
+    inverse: &[f32],
+    to: &mut [f32],
+    start: usize,
+) {
+    let (rows, scale) = (inverse.len(), 1.0 / weight.len() as f32);
+    let (mut sums, mut products) = ([0.0f32; N], [0.0f32; N]);
+    for (row, weight) in weight.iter().enumerate() {
+        let (gradient, normal): (&[f32; N], &[f32; N]) =
+            (part(gradient, row * rows + start), part(normal, row * rows + start));
+        for i in 0..N {
+            let weighted = gradient[i] * weight;
+            sums[i] += weighted;
+            products[i] += weighted * normal[i];
         }
     }
-    sums.iter_mut().zip(&mut *products).for_each(|(sum, product)| {
-        *sum *= scale;
-        *product *= scale;
-    });
-    for (((gradient, normal), weight), to) in matrices().zip(to.chunks_exact_mut(rows)) {
-        let (normal, inverse) = (&normal[..to.len()], &inverse[..to.len()]);
-        for i in 0..to.len() {
+    let inverse: &[f32; N] = part(inverse, start);
+    for i in 0..N {
+        sums[i] *= scale;
+        products[i] *= scale;
+    }
+    for (row, weight) in weight.iter().enumerate() {
+        let at = row * rows + start;
+        let (gradient, normal): (&[f32; N], &[f32; N]) = (part(gradient, at), part(normal, at));
+        let to: &mut [f32; N] = to[at..].first_chunk_mut().expect("rows are whole lanes");
+        for i in 0..N {
             to[i] += inverse[i] * (gradient[i] * weight - (sums[i] + normal[i] * products[i]));
         }
     }

@@ -77,44 +77,41 @@ pub(super) fn pack_bf16<R: Rows>(
     plain: &mut [u16],
     pairs: &mut [u32],
 ) {
-    let native = multiversion::target::selected_target!().supports_feature_str("avx512bf16");
+    const NATIVE: bool = multiversion::target::selected_target!().supports_feature_str("avx512bf16");
+    let round = |values: [f32; LANES]| {
+        #[cfg(target_arch = "x86_64")]
+        if NATIVE {
+            // SAFETY: this is the version for processors with AVX-512 F and AVX512-BF16.
+            return unsafe { bf16_native(&values) };
+        }
+        values.map(bf16)
+    };
     let Layout { length, stride } = layout;
     assert!(length <= stride, "rows of {length} numbers, {stride} apart");
     for row in 0..count {
         let (before, this) = plain.split_at_mut(row * stride);
         let this = &mut this[..length];
-        let even = if row % 2 == 1 { &before[(row - 1) * stride..][..length] } else { &[] };
-        let lone = row + 1 == count && row % 2 == 0;
-        let pair = match pairs.is_empty() || (row % 2 == 0 && !lone) {
-            true => &mut [],
-            false => &mut pairs[row / 2 * length..][..length],
-        };
-        for at in (0..length).step_by(LANES) {
-            let values = rows.lanes(row, at);
-            #[cfg(target_arch = "x86_64")]
-            let rounded = match native {
-                // SAFETY: this is the version for processors with AVX-512 F and AVX512-BF16.
-                true => unsafe { bf16_native(&values) },
-                false => values.map(bf16),
-            };
-            #[cfg(not(target_arch = "x86_64"))]
-            let rounded = values.map(bf16);
-            store(&rounded, &mut this[at..]);
-            if pair.is_empty() {
-                continue;
-            }
-            let mut words = rounded.map(u32::from);
-            if let Some(even) = even.get(at..) {
-                match even.first_chunk::<LANES>() {
-                    Some(even) => (0..LANES).for_each(|i| words[i] = words[i] << 16 | u32::from(even[i])),
-                    None => words.iter_mut().zip(even).for_each(|(word, even)| {
-                        *word = *word << 16 | u32::from(*even);
-                    }),
-                }
-            }
-            store(&words, &mut pair[at..]);
+        let (whole, tail) = this.as_chunks_mut();
+        for (index, to) in whole.iter_mut().enumerate() {
+            *to = round(rows.lanes(row, index * LANES));
+        }
+        if !tail.is_empty() {
+            let lanes = round(rows.lanes(row, whole.len() * LANES));
+            tail.copy_from_slice(&lanes[..tail.len()]);
         }
         rows.end(row);
+        if pairs.is_empty() {
+            continue;
+        }
+        let pairs = &mut pairs[row / 2 * length..][..length];
+        if row % 2 == 1 {
+            let even = &before[(row - 1) * stride..][..length];
+            for ((pair, even), odd) in pairs.iter_mut().zip(even).zip(&*this) {
+                *pair = u32::from(*odd) << 16 | u32::from(*even);
+            }
+        } else if row + 1 == count {
+            pairs.iter_mut().zip(&*this).for_each(|(pair, even)| *pair = u32::from(*even));
+        }
     }
 }
 
@@ -122,19 +119,14 @@ pub(super) fn pack_bf16<R: Rows>(
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 pub(super) fn write<R: Rows>(rows: &mut R, length: usize, to: &mut [f32]) {
     for (row, to) in to.chunks_exact_mut(length).enumerate() {
-        for at in (0..length).step_by(LANES) {
-            store(&rows.lanes(row, at), &mut to[at..]);
+        let (whole, tail) = to.as_chunks_mut();
+        for (index, to) in whole.iter_mut().enumerate() {
+            *to = rows.lanes(row, index * LANES);
+        }
+        if !tail.is_empty() {
+            tail.copy_from_slice(&rows.lanes(row, whole.len() * LANES)[..tail.len()]);
         }
         rows.end(row);
-    }
-}
-
-/// As many of the lanes as there is room for.
-#[inline(always)]
-fn store<T: Copy>(lanes: &[T; LANES], to: &mut [T]) {
-    match to.first_chunk_mut() {
-        Some(to) => *to = *lanes,
-        None => to.copy_from_slice(&lanes[..to.len()]),
     }
 }
 

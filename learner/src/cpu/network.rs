@@ -78,12 +78,10 @@ impl Norm {
         from: &[f32],
         to: &mut [f32],
         gradient: Option<&mut [f32]>,
-        scratch: &mut [Buffer<f32>; 2],
     ) {
         let (weight, _) = self.split(values);
         let parameters = gradient.map(|gradient| gradient[self.range.clone()].split_at_mut(self.width));
-        let scratch = scratch.each_mut().map(|scratch| &mut scratch[..]);
-        kernels::layer_norm_gradient(from, weight, &saved.normal, &saved.inverse, to, parameters, scratch);
+        kernels::layer_norm_gradient(from, weight, &saved.normal, &saved.inverse, to, parameters);
     }
 }
 
@@ -226,7 +224,7 @@ impl Network {
     ) {
         let mut weights = weights.iter().rev();
         let mut next_weights = || weights.next().expect("one for every linear layer");
-        let Trace { layers, output_gradients, head_gradients, head_weights, front, back, wide, scratch, .. } = trace;
+        let Trace { layers, output_gradients, head_gradients, head_weights, front, back, wide, .. } = trace;
         let heads = self.heads.iter().zip(output_gradients).zip(head_gradients);
         for (index, ((head, output), operand)) in heads.rev().enumerate() {
             operand.pack(&mut AsTheyAre { values: output, length: operand.rows });
@@ -245,8 +243,8 @@ impl Network {
             let rows = saved.rows;
             match layer {
                 Layer::Norm(norm) => {
-                    back.fill(0.0);
-                    norm.backward(values, &saved.norm, front, back, gradient.as_deref_mut(), scratch);
+                    back[..saved.result.len()].fill(0.0);
+                    norm.backward(values, &saved.norm, front, back, gradient.as_deref_mut());
                     std::mem::swap(front, back);
                 }
                 Layer::Block { norm, up, down } => {
@@ -267,7 +265,7 @@ impl Network {
                         weight_gradient(&saved.wide_gradient, &saved.input, &mut gradient[up.weight()]);
                     }
                     next_weights().apply_transposed(&saved.wide_gradient, 0, false, back);
-                    norm.backward(values, &saved.norm, back, front, gradient.as_deref_mut(), scratch);
+                    norm.backward(values, &saved.norm, back, front, gradient.as_deref_mut());
                 }
                 Layer::Dense { linear, relu } => {
                     let result = match after.first() {
@@ -412,8 +410,6 @@ pub(super) struct Trace {
     front: Buffer<f32>,
     back: Buffer<f32>,
     wide: Buffer<f32>,
-    /// `[R]` each.
-    scratch: [Buffer<f32>; 2],
 }
 
 impl Trace {
@@ -435,7 +431,6 @@ impl Trace {
             front: memory.zeros(widest),
             back: memory.zeros(widest),
             wide: memory.zeros(wide),
-            scratch: [memory.zeros(rows), memory.zeros(rows)],
             layers,
         }
     }
