@@ -94,13 +94,15 @@ impl Rows for Gradient<'_> {
             None => {}
             Some(Numbers::F32(result)) => {
                 let result = lanes(result, start);
-                (0..LANES).for_each(|lane| values[lane] = if result[lane] > 0.0 { values[lane] } else { 0.0 });
+                (0..LANES)
+                    .for_each(|lane| values[lane] = if result[lane] > 0.0 { values[lane] } else { 0.0 });
             }
             Some(Numbers::Bf16(result)) => {
                 let result: [u16; LANES] = lanes(result, start);
                 // Not zero and no sign: a NaN may pass.
                 let positive = |bits: u16| bits.wrapping_sub(1) < 0x7fff;
-                (0..LANES).for_each(|lane| values[lane] = if positive(result[lane]) { values[lane] } else { 0.0 });
+                (0..LANES)
+                    .for_each(|lane| values[lane] = if positive(result[lane]) { values[lane] } else { 0.0 });
             }
         }
         (0..LANES).for_each(|lane| self.sum[lane] += values[lane]);

@@ -1,9 +1,11 @@
 //! The update of SAC written out for processors: the same mathematics as [`crate::sac`]'s, without autograd.
 //!
-//! A minibatch is divided over the threads by transitions. Each goes forward and back through its own
-//! ([`network`]) on products in bfloat16 or float32 ([`product`], of what [`layout`] lays out) and vectorised passes between
-//! them ([`kernels`], [`math`]); the threads' gradients are added in a fixed order, and one pass over the flat buffers does
-//! AdamW, Polyak and the layout of the new weights ([`step`]); [`update`] is the whole. The heads, the losses and all that is kept stay float32.
+//! A minibatch is divided over the threads by transitions. Each goes forward and back through its own ([`network`]) on
+//! products in bfloat16 or float32 ([`product`]). What is computed between two products ([`kernels`], [`math`]) goes
+//! straight into the layout that the next one reads ([`layout`]), in memory on huge pages ([`memory`]). The threads'
+//! gradients are added in a fixed order, and one pass over the flat buffers does AdamW, Polyak and the layout of the new
+//! weights, few outputs at a time ([`step`]); [`update`] is the whole. The heads, the losses and all that is kept stay
+//! float32.
 //!
 //! Given the same number of threads, the same minibatches give the same bits.
 

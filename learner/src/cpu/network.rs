@@ -424,9 +424,7 @@ impl Trace {
             rows,
             outputs: heads().map(|outputs| memory.zeros(outputs * rows)).collect(),
             output_gradients: heads().map(|outputs| memory.zeros(outputs * rows)).collect(),
-            head_gradients: heads()
-                .map(|outputs| Operand::new(Format::F32, outputs, rows, memory))
-                .collect(),
+            head_gradients: heads().map(|outputs| Operand::new(Format::F32, outputs, rows, memory)).collect(),
             head_weights: memory.zeros(head_weights),
             front: memory.zeros(widest),
             back: memory.zeros(widest),

@@ -53,6 +53,7 @@ fn configurations() -> Vec<SacConfig> {
     vec![
         mlp(&[32, 32], 2),
         mlp(&[19, 7, 24], 3),
+        mlp(&[90, 130], 1),
         simba((16, 1), (32, 2), 1),
         simba((9, 2), (17, 1), 2),
         simba((8, 0), (8, 0), 1),
@@ -95,7 +96,7 @@ fn largest_difference(a: &[f32], b: &[f32]) -> f32 {
 #[test]
 fn in_float32_four_updates_are_autograds_for_every_network_batch_and_number_of_threads() {
     for config in configurations() {
-        for (rows, threads) in [(5, 1), (48, 1), (50, 2), (33, 3)] {
+        for (rows, threads) in [(5, 1), (48, 1), (50, 2), (33, 3), (1030, 1)] {
             let (exact, exact_losses) = train(&config, 1, rows, true);
             let (ours, losses) = train(&config, threads, rows, false);
             let difference = largest_difference(&exact, &ours);
@@ -169,12 +170,16 @@ fn a_product_is_that_of_the_rounded_numbers_in_one_block_and_in_many() {
             let size = Size { m, n, k: padded };
             let mut result = vec![1.0; m * n];
             for accumulate in [false, true] {
-                Product { format, size, lda: padded, ldb: n, ldc: n, accumulate }
-                    .run(&left, right.right(), &mut result);
+                Product { format, size, lda: padded, ldb: n, ldc: n, accumulate }.run(
+                    &left,
+                    right.right(),
+                    &mut result,
+                );
             }
             for row in 0..m {
                 for column in 0..n {
-                    let term = |i: usize| f64::from(rounded(a[row * k + i])) * f64::from(rounded(b[i * n + column]));
+                    let term =
+                        |i: usize| f64::from(rounded(a[row * k + i])) * f64::from(rounded(b[i * n + column]));
                     let error = f64::from(result[row * n + column]) - 2.0 * (0..k).map(term).sum::<f64>();
                     assert!(error.abs() < 1e-3, "{format:?}, {m} × {n} × {k}: {error} at [{row}, {column}]");
                 }

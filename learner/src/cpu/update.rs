@@ -8,8 +8,8 @@ use rayon::prelude::*;
 
 use super::kernels::{self, AdamStep, LANES, Motor};
 use super::layout;
-use super::network::{Network, Trace, Ways};
 use super::memory::{Buffer, Memory};
+use super::network::{Network, Trace, Ways};
 use super::product::{Format, Weights};
 use super::step::{Flat, cut, take};
 use crate::sac::Batch;
@@ -407,12 +407,7 @@ impl Worker {
     }
 }
 
-fn motor<'a>(
-    outputs: &'a [Buffer<f32>],
-    noise: &'a [f32],
-    beta: &'a [f32],
-    part: Range<usize>,
-) -> Motor<'a> {
+fn motor<'a>(outputs: &'a [Buffer<f32>], noise: &'a [f32], beta: &'a [f32], part: Range<usize>) -> Motor<'a> {
     Motor {
         mean: &outputs[0][part.clone()],
         raw_log_std: &outputs[1][part.clone()],
