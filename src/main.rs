@@ -90,8 +90,35 @@ fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            eprintln!("error: {}", reasons(&error));
             ExitCode::FAILURE
         }
+    }
+}
+
+/// An error and what caused it, each said once: many name their cause in their own words already.
+fn reasons(error: &anyhow::Error) -> String {
+    error.chain().map(ToString::to_string).fold(String::new(), |said, cause| {
+        if said.is_empty() {
+            cause
+        } else if said.contains(&cause) {
+            said
+        } else {
+            format!("{said}: {cause}")
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use anyhow::Context;
+
+    #[test]
+    fn every_reason_is_said_once() {
+        let cause = std::io::Error::other("the disk is full");
+        let error = getup_policy::ModelError::Io { path: "a.safetensors".into(), source: cause };
+        let error = Err::<(), _>(error).context("the run ends").unwrap_err();
+        let said = super::reasons(&error);
+        assert_eq!(said, "the run ends: cannot access the model a.safetensors: the disk is full");
     }
 }
