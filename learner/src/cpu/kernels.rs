@@ -9,7 +9,7 @@ use multiversion::multiversion;
 
 use super::layout::Rows;
 use super::math;
-use super::product::Numbers;
+use super::operand::Numbers;
 
 /// Numbers of the widest vector; R is a multiple of it.
 pub(super) const LANES: usize = 16;

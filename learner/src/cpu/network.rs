@@ -1,4 +1,4 @@
-//! A body with its heads, forward and backward, on the layouts of `product`.
+//! A body with its heads, forward and backward, on the layouts of `operand`.
 //!
 //! A [`Network`] is the shape and where each parameter lies in the flat buffer; [`Trace`] is what one pass over R
 //! transitions leaves for its way back. Nothing is allocated in a pass.
@@ -10,7 +10,8 @@ use getup_policy::Body;
 use super::kernels::{self, BiasRelu, Gradient, Normal};
 use super::layout::{self, AsTheyAre};
 use super::memory::{Buffer, Memory};
-use super::product::{Format, Numbers, Operand, Weights, weight_gradient, weight_gradient_transposed};
+use super::operand::{Numbers, Operand, Weights, weight_gradient, weight_gradient_transposed};
+use super::product::Format;
 
 /// `y = W·x + b`.
 #[derive(Clone, Debug)]

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use super::kernels::{self, AdamStep};
 use super::network::Network;
-use super::product::Weights;
+use super::operand::Weights;
 
 /// The flat buffers of networks and of their optimizer.
 pub(crate) struct Flat<'a> {

@@ -6,7 +6,8 @@ use tch::Device;
 
 use super::layout::{self, AsTheyAre};
 use super::memory::Memory;
-use super::product::{Format, Operand, Product, Size};
+use super::operand::Operand;
+use super::product::{Format, Product, Size};
 use crate::config::{NetworkKind, Precision, SacConfig};
 use crate::parameters::to_vec;
 use crate::sac::{Batch, Losses, Sac, TaskShape};

@@ -10,7 +10,8 @@ use super::kernels::{self, AdamStep, LANES, Motor};
 use super::layout;
 use super::memory::{Buffer, Memory};
 use super::network::{Network, Trace, Ways};
-use super::product::{Format, Weights};
+use super::operand::Weights;
+use super::product::Format;
 use super::step::{Flat, cut, take};
 use crate::sac::Batch;
 
