@@ -26,6 +26,10 @@ pub struct TaskConfig {
     /// Whether falling ends a training episode for good: a head that was over 1.4 m sinks under 1 m. Without, a fall
     /// costs no more than the second that it takes to rise again.
     pub fall_ends: bool,
+    /// Share of the `stand` term that a head under 1.43 m costs in training, from 0 to 1: a step 0.02 m wide. Without, a
+    /// crouch pays nearly as much as standing, and a little dip from it is under the 1.4 m of an evaluation. A run that
+    /// goes on may change it; what its replay holds was paid as it was then.
+    pub crouch_cost: f64,
 }
 
 /// The shape of the reward's `stand` term (App. B.1).
@@ -50,6 +54,7 @@ impl Default for TaskConfig {
             episode_steps: 250,
             stand: Stand::LongTail,
             fall_ends: false,
+            crouch_cost: 0.0,
         }
     }
 }
@@ -68,6 +73,9 @@ impl TaskConfig {
         }
         if !(self.ragdoll_std.is_finite() && self.ragdoll_std >= 0.0) {
             return Err(ConfigError::RagdollStd(self.ragdoll_std));
+        }
+        if !(0.0..=1.0).contains(&self.crouch_cost) {
+            return Err(ConfigError::CrouchCost(self.crouch_cost));
         }
         if self.episode_steps == 0 {
             return Err(ConfigError::EpisodeSteps);

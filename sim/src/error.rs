@@ -71,6 +71,9 @@ pub enum ConfigError {
         "task.ragdoll_std is {0}; it must be finite and at least 0 (0 falls limp, the paper's text uses 0.1)"
     )]
     RagdollStd(f64),
+    /// A crouch that costs less than nothing or more than everything.
+    #[error("task.crouch_cost is {0}; it must be from 0 (the paper's) to 1")]
+    CrouchCost(f64),
     /// Episodes without a step.
     #[error("task.episode_steps is 0; it must be at least 1 (the paper's is 250)")]
     EpisodeSteps,

@@ -16,6 +16,9 @@ const STAND_HEIGHT: f64 = 1.55;
 /// The head of a character that is up is at least this high, in metres.
 pub const UP_HEIGHT: f64 = 1.4;
 
+/// The head's height at which half of a crouch's cost is due, and how wide the step is, in metres.
+const CROUCH: (f64, f64) = (1.43, 0.02);
+
 /// Once it was up, a head under this has fallen, in metres.
 const DOWN_HEIGHT: f64 = 1.0;
 
@@ -55,6 +58,7 @@ pub struct GetUp {
     control_limit: f64,
     stand: Stand,
     fall_ends: bool,
+    crouch_cost: f64,
     resets: Resets,
     standing: Standing,
     bodies: Bodies,
@@ -101,6 +105,7 @@ impl GetUp {
             control_limit,
             stand: config.stand,
             fall_ends: config.fall_ends,
+            crouch_cost: config.crouch_cost,
             resets: Resets::new(vec![(1.0, Source::Fall(fall))])?,
             bodies: Bodies {
                 torso: world.body("torso")?,
@@ -117,7 +122,11 @@ impl GetUp {
             Stand::LongTail => (STAND_HEIGHT / 4.0, 0.2, Sigmoid::LongTail),
             Stand::Gaussian => (0.37, 0.1, Sigmoid::Gaussian),
         };
-        tolerance(world.head_height(), [STAND_HEIGHT, f64::INFINITY], margin, value_at_margin, sigmoid)
+        let height = world.head_height();
+        let (half, width) = CROUCH;
+        let crouched = 1.0 / (1.0 + ((height - half) / width).exp());
+        tolerance(height, [STAND_HEIGHT, f64::INFINITY], margin, value_at_margin, sigmoid)
+            * (1.0 - self.crouch_cost * crouched)
     }
 
     fn straight(&self, world: &World) -> f64 {

@@ -198,6 +198,7 @@ fn a_bad_setting_is_named_with_its_value() {
     let default = TaskConfig::default;
     assert_eq!(refuse(TaskConfig { physics_hz: 400, ..default() }), ConfigError::PhysicsHz(400));
     assert_eq!(refuse(TaskConfig { ragdoll_std: -0.1, ..default() }), ConfigError::RagdollStd(-0.1));
+    assert_eq!(refuse(TaskConfig { crouch_cost: 1.5, ..default() }), ConfigError::CrouchCost(1.5));
     assert_eq!(refuse(TaskConfig { episode_steps: 0, ..default() }), ConfigError::EpisodeSteps);
     let error = refuse(TaskConfig { name: "walk".to_owned(), ..default() });
     assert_eq!(error.to_string(), "task.name is \"walk\"; the only task is \"getup\"");
@@ -213,6 +214,7 @@ fn no_training_setting_softens_an_evaluation() {
         episode_steps: 10,
         stand: Stand::Gaussian,
         fall_ends: true,
+        crouch_cost: 0.5,
         ..TaskConfig::default()
     };
     let expected = TaskConfig { character: Character::OneArm, physics_hz: 800, ..TaskConfig::default() };
@@ -315,6 +317,36 @@ fn a_high_start_depends_on_its_seed_alone_and_ends_its_limp_steps_like_a_fall() 
             assert_eq!(used.step(&action(step)).unwrap().truncated, step == 250);
         }
     }
+}
+
+#[test]
+fn a_crouch_costs_its_share_of_the_stand_term_and_standing_nothing() {
+    let mut costly = lane(&TaskConfig { crouch_cost: 0.4, ..TaskConfig::default() });
+    let (mut free, mut seen) = (standard(), [0; 2]);
+    for seed in 0..20 {
+        costly.begin_standing(seed, 1.0);
+        free.begin_standing(seed, 1.0);
+        fall(&mut costly);
+        fall(&mut free);
+        for _ in 0..60 {
+            costly.step(&[0.0; 21]).unwrap();
+            free.step(&[0.0; 21]).unwrap();
+            let kept = costly.terms()[0] / free.terms()[0];
+            assert!((0.599..=1.0).contains(&kept) && costly.terms()[1..] == free.terms()[1..]);
+            match costly.head_height() {
+                up if up > 1.45 => {
+                    assert!(kept > 0.89, "{kept} at {up} m");
+                    seen[0] += 1;
+                }
+                down if down < 1.3 => {
+                    assert!(kept < 0.605, "{kept} at {down} m");
+                    seen[1] += 1;
+                }
+                _ => {}
+            }
+        }
+    }
+    assert!(seen.iter().all(|count| *count > 0), "{seen:?}");
 }
 
 #[test]
