@@ -5,7 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
-use getup_learner::checkpoint::Checkpoint;
+use getup_learner::beginning::Beginning;
+use getup_learner::config::SacConfig;
 use getup_learner::device::{self, Device};
 use getup_learner::hub::Hub;
 use getup_learner::hub_metrics::HubMetrics;
@@ -37,8 +38,8 @@ pub(crate) struct Args {
     /// The run's folder: checkpoints, models, evaluations. [default: `runs/` and the run's name]
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
-    /// Where its folder holds no checkpoint yet, begin with the actor of this one, a file of another run's checkpoints/,
-    /// and with its critics where they have the configured shape.
+    /// Where its folder holds no checkpoint yet, begin with the actor of this file: a model, or a checkpoint of another
+    /// run, whose critics are taken too where they have the configured shape.
     #[arg(long, value_name = "FILE")]
     from: Option<PathBuf>,
 }
@@ -59,8 +60,9 @@ async fn serve(
     from: Option<&Path>,
 ) -> Result<()> {
     check_preset(config, &folder)?;
-    let start = match from.map(check_checkpoint).transpose()? {
-        Some(checkpoint) if !folder.has_checkpoint() => Start::Checkpoint(checkpoint),
+    let beginning = from.map(load_beginning).transpose()?;
+    let start = match &beginning {
+        Some(beginning) if !folder.has_checkpoint() => Start::From(beginning),
         _ => Start::Newest,
     };
     folder.create()?;
@@ -122,10 +124,9 @@ fn check_preset(config: &Config, folder: &RunFolder) -> Result<()> {
     Ok(())
 }
 
-/// Refuses what is no checkpoint before anything is made for the run.
-pub(crate) fn check_checkpoint(path: &Path) -> Result<&Path> {
-    Checkpoint::load(path).with_context(|| "--from")?;
-    Ok(path)
+/// Refuses what no run can begin with before anything is made for the run.
+pub(crate) fn load_beginning(path: &Path) -> Result<Beginning> {
+    Beginning::load(path).context("--from")
 }
 
 /// The meeting place of this learner and its actors, and the number of this start of a learner on the run.
@@ -157,14 +158,17 @@ pub(crate) fn make_trainer(
 ) -> Result<Trainer> {
     let task = GetUp::new(&config.task, config.control_limit())?;
     let observation = task.observation_width();
+    // A ring removes whole segments: it is never full to the last transition.
+    let refill_steps = config.sac.refill_steps.min(config.replay.capacity as u64 / 2);
     let trainer = TrainerConfig {
         run: config.run.clone(),
         character: config.task.character.to_string(),
         seed: config.seed,
+        replays: config.network.replays().len(),
         steps: (config.steps > 0).then_some(config.steps),
         // β̂ is the last number of an observation.
         shape: TaskShape { observation, action: task.action_width(), unnormalized: vec![observation - 1] },
-        sac: config.sac.clone(),
+        sac: SacConfig { refill_steps, ..config.sac.clone() },
         curriculum: config.curriculum.clone(),
         evaluation: config.evaluation.clone(),
         learner: config.learner.clone(),

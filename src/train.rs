@@ -18,7 +18,7 @@ use getup_replay::{LocalSource, ReplayMetrics, Store};
 use getup_telemetry::LogFormat;
 
 use crate::config::{Config, ConfigArgs};
-use crate::learner::{check_checkpoint, make_hub, make_trainer, sample_options};
+use crate::learner::{load_beginning, make_hub, make_trainer, sample_options};
 use crate::links::{HubLink, StoreWriter};
 use crate::role::Role;
 
@@ -35,7 +35,7 @@ pub(crate) struct Args {
     /// Go on with the run in that folder, under its own config.toml.
     #[arg(long)]
     resume: bool,
-    /// Begin a new run with the actor of this checkpoint, a file of another run's checkpoints/, and with its critics
+    /// Begin a new run with the actor of this file: a model, or a checkpoint of another run, whose critics are taken too
     /// where they have the configured shape. Curriculum and counters begin anew.
     #[arg(long, value_name = "FILE", conflicts_with = "resume")]
     from: Option<PathBuf>,
@@ -60,8 +60,9 @@ pub(crate) struct Args {
 
 pub(crate) fn run(mut arguments: Args) -> Result<()> {
     let (config, folder) = prepare(&mut arguments)?;
-    let start = match (&arguments.from, arguments.resume) {
-        (Some(checkpoint), _) => Start::Checkpoint(check_checkpoint(checkpoint)?),
+    let beginning = arguments.from.as_deref().map(load_beginning).transpose()?;
+    let start = match (&beginning, arguments.resume) {
+        (Some(beginning), _) => Start::From(beginning),
         (None, true) => Start::Newest,
         (None, false) => Start::Untrained,
     };

@@ -85,13 +85,14 @@ fn a_run_goes_on_without_its_replay_and_another_begins_with_its_networks() {
     succeed(Command::new("cp").args(["-r", "first", "carried"]).current_dir(folder.path()));
     std::fs::remove_dir_all(carried.join("replay")).unwrap();
     let resume = ["train", "--resume", "--run", "carried", "--steps", &(env_steps + 1_000).to_string()];
-    succeed(getup(&resume).args(["--set", "network.learner_metrics=127.0.0.1:0"]).current_dir(folder.path()));
+    let refill = ["--set", "network.learner_metrics=127.0.0.1:0", "--set", "sac.refill_steps=800"];
+    succeed(getup(&resume).args(refill).current_dir(folder.path()));
     let after = evaluations(&carried).pop().unwrap();
     assert!(after["env_steps"].as_u64().unwrap() >= env_steps + 1_000, "{after}");
-    // The ring is filled before updates go on: at 0.1 updates an env step and 500 env steps for the ring, the
-    // other half of them.
+    // The ring is filled before updates go on: at 0.1 updates an env step and 800 env steps for the ring, the
+    // other fifth of them, and what the actor made beyond.
     let made = after["updates"].as_u64().unwrap() - updates;
-    assert!((1..=100).contains(&made), "{made} updates");
+    assert!((1..=60).contains(&made), "{made} updates");
 
     let checkpoints = std::fs::read_dir(first.join("checkpoints")).unwrap();
     let checkpoint = checkpoints.map(|entry| entry.unwrap().path()).max().unwrap();
@@ -108,9 +109,24 @@ fn a_run_goes_on_without_its_replay_and_another_begins_with_its_networks() {
         "the same actor on the same falls"
     );
     assert!(second.iter().all(|line| line["stage"] == 0 && line["beta"] == 1.0), "{second:?}");
-    let from = ["--run", "third", "--from", checkpoint.to_str().unwrap()];
-    let wider = fail(train(folder.path(), &from).args(["--set", "sac.hidden=[8, 8]"]));
-    assert!(wider.contains("the configured networks have"), "{wider}");
+    // A model is an actor too; its critics are not there.
+    let model = ["--run", "of-a-model", "--from", "first/models/last.safetensors", "--steps", "1"];
+    let mut command = train(folder.path(), &model);
+    polish.iter().for_each(|setting| _ = command.args(["--set", setting]));
+    succeed(command.args(["--set", "sac.critics_first=1000000"]));
+    let of_a_model = evaluations(&folder.path().join("of-a-model"));
+    assert!(of_a_model.last().unwrap()["updates"].as_u64().unwrap() > 0, "{of_a_model:?}");
+    assert!(of_a_model.iter().all(|line| line["mean"] == second[0]["mean"]), "critics alone: {of_a_model:?}");
+
+    for (file, expected) in [
+        (checkpoint.to_str().unwrap(), "the configured networks have"),
+        ("first/models/last.safetensors", "Mlp { hidden: [8, 8] }: begin with another model, or set [sac]"),
+        ("first/config.toml", "the checkpoint first/config.toml is not usable"),
+    ] {
+        let from = ["--run", "third", "--from", file];
+        let refused = fail(train(folder.path(), &from).args(["--set", "sac.hidden=[8, 8]"]));
+        assert!(refused.contains(expected), "{refused}");
+    }
 }
 
 #[test]

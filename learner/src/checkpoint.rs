@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use getup_policy::ModelError;
 use rand_chacha::ChaCha8Rng;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -16,7 +17,7 @@ use crate::adam::ScalarAdam;
 use crate::curriculum::Curriculum;
 use crate::parameters::to_vec;
 use crate::run_folder::{FolderError, write_atomically};
-use crate::sac::Sac;
+use crate::sac::{ActorMismatch, Sac};
 use crate::statistics::RunningStatistics;
 
 const FORMAT: &str = "getup-checkpoint";
@@ -58,6 +59,17 @@ pub enum CheckpointError {
         /// Its version.
         found: u64,
     },
+    /// A model file that a run was to begin with.
+    #[error("cannot begin with the model {path}")]
+    Model {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: ModelError,
+    },
+    /// Its actor is not like the configured one.
+    #[error(transparent)]
+    Actor(#[from] ActorMismatch),
     /// The networks of the configuration have another shape.
     #[error(
         "tensor {name:?} of the checkpoint has {found} numbers, the configured networks have {wanted}: resume \
@@ -100,6 +112,9 @@ pub struct Checkpoint {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Scalars {
     updates: u64,
+    /// See [`Sac::is_trained`].
+    #[serde(default)]
+    began_trained: bool,
     actor_steps: u64,
     critics_steps: u64,
     log_temperature: f64,
@@ -137,6 +152,7 @@ impl Checkpoint {
             buffers(sac).into_iter().map(|(name, tensor)| (name.to_owned(), to_vec(tensor))).collect();
         let scalars = Scalars {
             updates: sac.updates,
+            began_trained: sac.began_trained,
             actor_steps: sac.actor_adam.steps,
             critics_steps: sac.critics_adam.steps,
             log_temperature: sac.log_temperature,
@@ -152,6 +168,7 @@ impl Checkpoint {
         self.put(sac, |_| true)?;
         sac.critics_adam.steps = self.scalars.critics_steps;
         sac.updates = self.scalars.updates;
+        sac.began_trained = self.scalars.began_trained;
         sac.rng = self.scalars.rng.clone();
         Ok(())
     }
@@ -161,6 +178,7 @@ impl Checkpoint {
     pub fn begin(&self, sac: &mut Sac) -> Result<(), CheckpointError> {
         let same = self.tensors["critics"].len() == sac.critics.parameters.flat().numel();
         self.put(sac, |name| same || name.starts_with("actor"))?;
+        sac.began_trained = true;
         if same {
             sac.critics_adam.steps = self.scalars.critics_steps;
         } else {

@@ -21,6 +21,8 @@ pub mod leases;
 #[cfg(feature = "torch")]
 mod adam;
 #[cfg(feature = "torch")]
+pub mod beginning;
+#[cfg(feature = "torch")]
 pub mod checkpoint;
 #[cfg(feature = "torch")]
 mod cpu;

@@ -125,6 +125,17 @@ pub struct NonFiniteLoss {
     pub update: u64,
 }
 
+/// A model whose actor a run cannot begin with.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error(
+    "the model's {what}: {found}; the configuration's: {wanted}: begin with another model, or set [sac] as its run did"
+)]
+pub struct ActorMismatch {
+    what: &'static str,
+    found: String,
+    wanted: String,
+}
+
 /// The learner's networks with everything that training them needs.
 pub struct Sac {
     pub(crate) config: SacConfig,
@@ -141,6 +152,8 @@ pub struct Sac {
     pub(crate) statistics: RunningStatistics,
     pub(crate) rng: ChaCha8Rng,
     pub(crate) updates: u64,
+    /// Whether the actor is another run's.
+    pub(crate) began_trained: bool,
     /// See [`Sac::td_errors`].
     td_errors: Vec<f32>,
     /// See [`Sac::phases`].
@@ -185,6 +198,7 @@ impl Sac {
             critics,
             rng,
             updates: 0,
+            began_trained: false,
             td_errors: Vec::new(),
             phases: Phases::default(),
             gradients: None,
@@ -197,6 +211,29 @@ impl Sac {
         self.cpu = OnCpu::Unknown;
     }
 
+    /// Puts another run's actor in the place of the untrained one, with the statistics that it learned under.
+    pub(crate) fn begin_with(&mut self, policy: &Policy) -> Result<(), ActorMismatch> {
+        let mismatch =
+            |what: &'static str, found: String, wanted: String| ActorMismatch { what, found, wanted };
+        if policy.shape != self.actor.shape {
+            let shapes = [&policy.shape, &self.actor.shape].map(|shape| format!("{shape:?}"));
+            let [found, wanted] = shapes;
+            return Err(mismatch("shape", found, wanted));
+        }
+        let normalizes = |does: bool| if does { "normalised" } else { "as they are" }.to_owned();
+        if policy.statistics.is_some() != self.config.normalize_observations {
+            let (found, wanted) = (policy.statistics.is_some(), self.config.normalize_observations);
+            return Err(mismatch("observations", normalizes(found), normalizes(wanted)));
+        }
+        self.actor = Actor::new(policy, self.config.precision.kind(self.device), self.device);
+        if let Some(statistics) = &policy.statistics {
+            self.statistics.begin_with(statistics);
+        }
+        self.began_trained = true;
+        self.changed();
+        Ok(())
+    }
+
     /// Updates made so far.
     pub fn updates(&self) -> u64 {
         self.updates
@@ -204,7 +241,7 @@ impl Sac {
 
     /// Whether any update was made, by this run or by the one whose networks it begins with.
     pub fn is_trained(&self) -> bool {
-        self.updates > 0 || self.actor_adam.steps > 0
+        self.updates > 0 || self.began_trained
     }
 
     /// Sets the learning rates of actor and critics for `env_steps` of the run.
@@ -310,10 +347,15 @@ impl Sac {
         self.critics_adam.step(&mut self.critics.parameters, &critics_gradient);
         lap.add_to(&mut self.phases.optimizer);
 
-        // mean (α log π(a|s) − min Q(s, a)), a ~ π(s)
+        // mean (α log π(a|s) − min Q(s, a) + κ Σ (a − ã)²), a ~ π(s), ã the replay's
         let sample = self.actor.forward(&observation).sample(&beta, &noise);
         let value = self.critics.minimum(&observation, &sample.action);
-        let actor_loss = (&sample.log_prob * temperature - value).mean(Kind::Float);
+        let mut actor_loss = (&sample.log_prob * temperature - value).mean(Kind::Float);
+        if self.config.anchor > 0.0 {
+            let squares =
+                (&sample.action - &action).square().sum_dim_intlist(&[1i64][..], false, Kind::Float);
+            actor_loss += squares.mean(Kind::Float) * self.config.anchor;
+        }
         let actor = self.finite("actor", actor_loss.double_value(&[]))?;
         let actor_gradient = self.actor.parameters.gradient(&actor_loss);
         lap.add_to(&mut self.phases.actor);
@@ -345,7 +387,9 @@ impl Sac {
         let (actor, critics) = (as_slice_mut(&mut actor), as_slice_mut(&mut critics));
         let targets = as_slice_mut(&mut targets);
         let temperature = self.log_temperature.exp() as f32;
-        let inputs = Inputs { batch, statistics: statistics.as_ref(), next_noise, noise, temperature };
+        let anchor = self.config.anchor as f32;
+        let inputs =
+            Inputs { batch, statistics: statistics.as_ref(), next_noise, noise, temperature, anchor };
 
         let critic = cpu.critics_backward(&inputs, Values { actor, critics, targets });
         let critic_loss = self.finite("critic", critic.loss)?;

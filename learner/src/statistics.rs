@@ -8,6 +8,9 @@ const VARIANCE_FLOOR: f64 = 1e-4;
 /// Largest magnitude of a normalised number.
 const CLIP: f32 = 10.0;
 
+/// What a model's statistics count for: its file does not say of how many observations they are.
+const FOREIGN_COUNT: f64 = 1e6;
+
 /// Statistics over all observations seen so far; part of the checkpoint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RunningStatistics {
@@ -49,6 +52,14 @@ impl RunningStatistics {
             *old += shift * added / total;
         }
         self.count = total;
+    }
+
+    /// Takes over what a model was normalised by, as if of [`FOREIGN_COUNT`] observations: those of this run move it
+    /// slowly, where they may.
+    pub(crate) fn begin_with(&mut self, statistics: &ObservationStatistics) {
+        self.count = FOREIGN_COUNT;
+        self.mean = statistics.mean.iter().map(|mean| f64::from(*mean)).collect();
+        self.squares = statistics.std.iter().map(|std| f64::from(*std).powi(2) * self.count).collect();
     }
 
     /// What travels with the weights.

@@ -5,7 +5,6 @@
 //! [`MinibatchSource`]; the deterministic mode of `getup train` feeds it step by step. Nothing here knows whether
 //! replay and actors are in the same process.
 
-use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -14,6 +13,7 @@ use getup_replay::{Minibatch, MinibatchSource, ReplayCounters, SampleError};
 use getup_telemetry::traces::{KeyValue, SpanKind};
 use getup_telemetry::{Registry, Shutdown, Traces};
 
+use crate::beginning::Beginning;
 use crate::checkpoint::{Checkpoint, CheckpointError, Progress};
 use crate::config::{ConfigError, CurriculumConfig, EvaluationConfig, LearnerConfig, SacConfig};
 use crate::curriculum::{Curriculum, Outcome};
@@ -26,9 +26,11 @@ mod broadcast;
 mod checkpoints;
 mod evaluations;
 mod pace;
+mod refill;
 
 use checkpoints::Checkpoints;
 use pace::Pace;
+use refill::Refill;
 
 /// How long the end of training waits for evaluations that are still out.
 const LAST_REPORTS: Duration = Duration::from_secs(120);
@@ -73,6 +75,8 @@ pub struct TrainerConfig {
     pub character: String,
     /// The run's seed.
     pub seed: u64,
+    /// Replays that the run's transitions are in.
+    pub replays: usize,
     /// Env steps after which training ends; none for the curriculum's end alone.
     pub steps: Option<u64>,
     /// What SAC must know of the task.
@@ -103,9 +107,9 @@ pub enum Ending {
 pub enum Start<'a> {
     /// Networks drawn from the seed.
     Untrained,
-    /// The actor of another run's checkpoint, and its critics where they have the configured shape. Curriculum and
-    /// counters begin anew.
-    Checkpoint(&'a Path),
+    /// Another run's actor, and its critics where they are there and have the configured shape. Curriculum and counters
+    /// begin anew.
+    From(&'a Beginning),
     /// Where the run's newest checkpoint stands, if it has one.
     Newest,
 }
@@ -121,6 +125,7 @@ pub struct Trainer {
     checkpoints: Checkpoints,
     metrics: LearnerMetrics,
     pace: Pace,
+    refill: Refill,
     version: PolicyVersion,
     evaluation: Option<v1::EvaluationSummary>,
     /// Updates behind the policy that was offered for evaluation last.
@@ -147,14 +152,14 @@ impl Trainer {
         let mut progress = Progress { next_evaluation: config.evaluation.every, ..Progress::default() };
         let resumed = match start {
             Start::Untrained => None,
-            Start::Checkpoint(path) => {
-                Checkpoint::load(path)?.begin(&mut sac)?;
+            Start::From(beginning) => {
+                beginning.begin(&mut sac)?;
                 None
             }
             Start::Newest => Checkpoint::newest(&folder.checkpoints())?,
         };
         let is_resumed = resumed.is_some();
-        if !is_resumed && !matches!(start, Start::Checkpoint(_)) {
+        if !is_resumed && !sac.is_trained() {
             config.sac.validate_untrained()?;
         }
         if let Some(checkpoint) = resumed {
@@ -167,6 +172,7 @@ impl Trainer {
         let mut trainer = Self {
             checkpoints: Checkpoints::new(folder.checkpoints(), &config.learner, metrics.clone()),
             pace: Pace::new(sac.updates()),
+            refill: Refill::new(config.sac.refill_steps, config.replays),
             version: PolicyVersion { incarnation, counter: 0 },
             ending: curriculum.outcome().map(Ending::Curriculum).or(already_past(&config, &progress)),
             evaluation: None,
@@ -188,7 +194,7 @@ impl Trainer {
                 trainer.offer(policy);
             }
         }
-        if matches!(start, Start::Checkpoint(_)) {
+        if matches!(start, Start::From(_)) {
             // On disk before the run is one that can be resumed.
             trainer.checkpoint();
             trainer.checkpoints.finish()?;
@@ -241,7 +247,11 @@ impl Trainer {
     /// Returns the priorities of its transitions by their keys, where the replay draws by priority.
     pub fn tick(&mut self, minibatch: Minibatch) -> Result<Vec<(u64, f32)>, TrainError> {
         let keys: Vec<u64> = minibatch.items.iter().map(|item| item.key).collect();
+        let before = self.sac.updates();
         self.learn(minibatch)?;
+        if self.sac.updates() == before {
+            return Ok(Vec::new());
+        }
         Ok(keys.into_iter().zip(self.sac.td_errors().iter().copied()).collect())
     }
 
@@ -250,6 +260,12 @@ impl Trainer {
         let followed = std::mem::take(&mut minibatch.traces);
         let began = (!followed.is_empty()).then(SystemTime::now);
         self.progress.count(&minibatch.counters);
+        if self.refill.goes_on(&minibatch.counters, self.made(), self.hub.waits()) {
+            if self.pace.is_time_to_show() {
+                self.show();
+            }
+            return self.take_reports();
+        }
         let mut batch = Batch::from_minibatch(&mut minibatch)?;
         batch.weight = minibatch.importance_weights(self.config.sac.importance_exponent as f32);
         if self.progress.env_steps < self.config.sac.normalize_until {
@@ -343,6 +359,15 @@ impl Trainer {
         }
         drop(wait);
         Ok(())
+    }
+
+    /// What a replay that is new to this learner should hold, at most: see [`Refill::goes_on`].
+    fn made(&self) -> u64 {
+        match (self.sac.is_trained(), self.sac.updates()) {
+            (false, _) => 0,
+            (true, 0) => u64::MAX,
+            (true, _) => self.progress.env_steps,
+        }
     }
 
     fn checkpoint(&mut self) {

@@ -56,8 +56,15 @@ pub struct SacConfig {
     pub updates_per_step: f64,
     /// Env steps of uniform actions before the first update; where the run begins with trained networks, of theirs.
     pub uniform_steps: u64,
+    /// Transitions that the replay holds before the updates of a trained actor go on: where a run begins with another's
+    /// (`--from`), resumes without its replay, or loses it. No more than the run has made, and at most half of `replay.capacity`.
+    pub refill_steps: u64,
     /// Updates at the start that leave the actor as it is: for one that begins trained, with critics that do not.
     pub critics_first: u64,
+    /// Weight of the squared distance between the actor's actions and the replay's in the actor's loss, κ; 0 for SAC.
+    /// It holds a trained actor near what it did lately while critics are young, and lets it move along with the replay
+    /// (Fujimoto & Gu 2021, of offline learning).
+    pub anchor: f64,
     /// Precision of the hidden layers' matrix products; weights, heads and losses are always float32.
     pub precision: Precision,
     /// Whether observations are normalised by running statistics.
@@ -170,7 +177,9 @@ impl Default for SacConfig {
             importance_exponent: 0.4,
             updates_per_step: 1.0,
             uniform_steps: 10_000,
+            refill_steps: 150_000,
             critics_first: 0,
+            anchor: 0.0,
             precision: Precision::Fp32,
             normalize_observations: false,
             normalize_until: 300_000,
@@ -214,6 +223,8 @@ impl SacConfig {
             &floor,
             "from 0 to sac.initial_temperature",
         )?;
+        let anchor = self.anchor;
+        check(anchor >= 0.0 && anchor.is_finite(), "sac.anchor", &anchor, "0 or more")?;
         let entropy = self.target_entropy.nats(1);
         check(entropy.is_finite(), "sac.target_entropy", &entropy, "a number of nats, or \"auto\"")?;
         let exponent = self.importance_exponent;

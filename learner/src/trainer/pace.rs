@@ -30,6 +30,15 @@ impl Pace {
         elapsed >= WINDOW || self.updates.is_multiple_of(100)
     }
 
+    /// For whoever makes no updates: true once in a while.
+    pub(super) fn is_time_to_show(&mut self) -> bool {
+        let is_time = self.window_start.elapsed() >= WINDOW;
+        if is_time {
+            (self.window_start, self.window_updates, self.per_second) = (Instant::now(), self.updates, 0.0);
+        }
+        is_time
+    }
+
     pub(super) fn per_second(&self) -> f64 {
         self.per_second
     }

@@ -1,0 +1,93 @@
+//! A trained actor meets a replay that holds too little of it: what follows from few transitions, all alike, unlearns
+//! within minutes what took an hour. So updates wait until the replay is filled again.
+//!
+//! Minibatches are drawn meanwhile and left unused: the rate limiter lets nobody run ahead of samples.
+
+use std::collections::BTreeMap;
+
+use getup_replay::ReplayCounters;
+use getup_telemetry::{WaitGuard, Waits};
+
+pub(super) struct Refill {
+    /// What each replay has to hold, in transitions.
+    share: u64,
+    replays: u64,
+    /// What those that were seen have to hold, by the store's name; 0 once they do.
+    wanted: BTreeMap<u64, u64>,
+    wait: Option<WaitGuard>,
+}
+
+impl Refill {
+    /// For a run in so many replays, which are to hold `steps` transitions together.
+    pub(super) fn new(steps: u64, replays: usize) -> Self {
+        let replays = replays.max(1) as u64;
+        Self { share: steps / replays, replays, wanted: BTreeMap::new(), wait: None }
+    }
+
+    /// Whether a minibatch of that replay comes too early.
+    ///
+    /// `made` are the env steps of the run so far, none where its actor is untrained: a replay that is new to the learner
+    /// has to hold its part of them, or of the configured ones where these are fewer.
+    pub(super) fn goes_on(&mut self, counters: &ReplayCounters, made: u64, waits: &Waits) -> bool {
+        let part = self.share.min(made / self.replays);
+        let entry = self.wanted.entry(counters.store).or_insert(part);
+        if counters.held >= *entry {
+            *entry = 0;
+        }
+        let wanted = *entry;
+        let goes_on = wanted > 0;
+        if self.wanted.values().all(|wanted| *wanted == 0) {
+            self.wait = None;
+        } else if goes_on {
+            let reason =
+                format!("the replay fills before updates go on: {} of {wanted} transitions", counters.held);
+            match &self.wait {
+                Some(wait) => wait.set_reason(reason),
+                None => self.wait = Some(waits.begin("learner", reason)),
+            }
+        }
+        goes_on
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use getup_telemetry::Registry;
+
+    fn held(store: u64, held: u64) -> ReplayCounters {
+        ReplayCounters { store, held, ..ReplayCounters::default() }
+    }
+
+    #[test]
+    fn a_replay_that_is_new_to_a_trained_actor_is_filled_once() {
+        let waits = Waits::new(&Registry::new());
+        let mut refill = Refill::new(1000, 1);
+        assert!(refill.goes_on(&held(7, 1), u64::MAX, &waits));
+        assert!(refill.goes_on(&held(7, 999), u64::MAX, &waits));
+        let shown: Vec<String> = waits.current().iter().map(ToString::to_string).collect();
+        assert!(shown.len() == 1 && shown[0].contains("999 of 1000 transitions"), "{shown:?}");
+        assert!(!refill.goes_on(&held(7, 1000), u64::MAX, &waits));
+        assert!(waits.current().is_empty());
+        assert!(!refill.goes_on(&held(7, 3), u64::MAX, &waits), "removed since");
+        assert!(refill.goes_on(&held(8, 3), u64::MAX, &waits), "another in its place");
+    }
+
+    #[test]
+    fn no_more_is_wanted_than_the_run_has_made() {
+        let waits = Waits::new(&Registry::new());
+        assert!(!Refill::new(1000, 1).goes_on(&held(7, 1), 0, &waits), "an untrained actor");
+        let mut refill = Refill::new(1000, 1);
+        assert!(refill.goes_on(&held(7, 39), 40, &waits) && !refill.goes_on(&held(7, 40), 40, &waits));
+    }
+
+    #[test]
+    fn each_of_several_replays_is_filled_with_its_part() {
+        let waits = Waits::new(&Registry::new());
+        let mut refill = Refill::new(1000, 4);
+        assert!(refill.goes_on(&held(1, 249), 5000, &waits));
+        assert!(!refill.goes_on(&held(2, 250), 5000, &waits));
+        assert!(!waits.current().is_empty(), "one is still filling");
+        assert!(!refill.goes_on(&held(1, 250), 5000, &waits) && waits.current().is_empty());
+    }
+}
