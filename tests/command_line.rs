@@ -120,7 +120,7 @@ fn a_run_goes_on_without_its_replay_and_another_begins_with_its_networks() {
 
     for (file, expected) in [
         (checkpoint.to_str().unwrap(), "the configured networks have"),
-        ("first/models/last.safetensors", "Mlp { hidden: [8, 8] }: begin with another model, or set [sac]"),
+        ("first/models/last.safetensors", "hidden: [8, 8] } }: begin with another model, or set [sac]"),
         ("first/config.toml", "the checkpoint first/config.toml is not usable"),
     ] {
         let from = ["--run", "third", "--from", file];
