@@ -26,10 +26,12 @@ pub struct TaskConfig {
     /// Whether falling ends a training episode for good: a head that was over 1.4 m sinks under 1 m. Without, a fall
     /// costs no more than the second that it takes to rise again.
     pub fall_ends: bool,
-    /// Share of the `stand` term that a head under 1.43 m costs in training, from 0 to 1: a step 0.02 m wide. Without, a
-    /// crouch pays nearly as much as standing, and a little dip from it is under the 1.4 m of an evaluation. A run that
-    /// goes on may change it; what its replay holds was paid as it was then.
+    /// Share of the `stand` term that a head under `crouch_height` costs in training, from 0 to 1. Without, a crouch pays
+    /// nearly as much as standing, and a little dip from it is under the 1.4 m of an evaluation. A run that goes on may
+    /// change both; what its replay holds was paid as it was then.
     pub crouch_cost: f64,
+    /// The head's height at which half of that is due, in metres: the middle of a step 0.02 m wide.
+    pub crouch_height: f64,
 }
 
 /// The shape of the reward's `stand` term (App. B.1).
@@ -55,6 +57,7 @@ impl Default for TaskConfig {
             stand: Stand::LongTail,
             fall_ends: false,
             crouch_cost: 0.0,
+            crouch_height: 1.43,
         }
     }
 }
@@ -76,6 +79,9 @@ impl TaskConfig {
         }
         if !(0.0..=1.0).contains(&self.crouch_cost) {
             return Err(ConfigError::CrouchCost(self.crouch_cost));
+        }
+        if !(self.crouch_height > 0.0 && self.crouch_height.is_finite()) {
+            return Err(ConfigError::CrouchHeight(self.crouch_height));
         }
         if self.episode_steps == 0 {
             return Err(ConfigError::EpisodeSteps);

@@ -74,6 +74,9 @@ pub enum ConfigError {
     /// A crouch that costs less than nothing or more than everything.
     #[error("task.crouch_cost is {0}; it must be from 0 (the paper's) to 1")]
     CrouchCost(f64),
+    /// A height at which nobody crouches.
+    #[error("task.crouch_height is {0}; it must be over 0 and finite (a head that is up is at 1.4 m)")]
+    CrouchHeight(f64),
     /// Episodes without a step.
     #[error("task.episode_steps is 0; it must be at least 1 (the paper's is 250)")]
     EpisodeSteps,

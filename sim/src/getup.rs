@@ -16,8 +16,8 @@ const STAND_HEIGHT: f64 = 1.55;
 /// The head of a character that is up is at least this high, in metres.
 pub const UP_HEIGHT: f64 = 1.4;
 
-/// The head's height at which half of a crouch's cost is due, and how wide the step is, in metres.
-const CROUCH: (f64, f64) = (1.43, 0.02);
+/// How wide the step is at which a crouch's cost sets in, in metres.
+const CROUCH_STEP: f64 = 0.02;
 
 /// Once it was up, a head under this has fallen, in metres.
 const DOWN_HEIGHT: f64 = 1.0;
@@ -59,6 +59,7 @@ pub struct GetUp {
     stand: Stand,
     fall_ends: bool,
     crouch_cost: f64,
+    crouch_height: f64,
     resets: Resets,
     standing: Standing,
     bodies: Bodies,
@@ -106,6 +107,7 @@ impl GetUp {
             stand: config.stand,
             fall_ends: config.fall_ends,
             crouch_cost: config.crouch_cost,
+            crouch_height: config.crouch_height,
             resets: Resets::new(vec![(1.0, Source::Fall(fall))])?,
             bodies: Bodies {
                 torso: world.body("torso")?,
@@ -123,8 +125,7 @@ impl GetUp {
             Stand::Gaussian => (0.37, 0.1, Sigmoid::Gaussian),
         };
         let height = world.head_height();
-        let (half, width) = CROUCH;
-        let crouched = 1.0 / (1.0 + ((height - half) / width).exp());
+        let crouched = 1.0 / (1.0 + ((height - self.crouch_height) / CROUCH_STEP).exp());
         tolerance(height, [STAND_HEIGHT, f64::INFINITY], margin, value_at_margin, sigmoid)
             * (1.0 - self.crouch_cost * crouched)
     }

@@ -199,6 +199,7 @@ fn a_bad_setting_is_named_with_its_value() {
     assert_eq!(refuse(TaskConfig { physics_hz: 400, ..default() }), ConfigError::PhysicsHz(400));
     assert_eq!(refuse(TaskConfig { ragdoll_std: -0.1, ..default() }), ConfigError::RagdollStd(-0.1));
     assert_eq!(refuse(TaskConfig { crouch_cost: 1.5, ..default() }), ConfigError::CrouchCost(1.5));
+    assert_eq!(refuse(TaskConfig { crouch_height: 0.0, ..default() }), ConfigError::CrouchHeight(0.0));
     assert_eq!(refuse(TaskConfig { episode_steps: 0, ..default() }), ConfigError::EpisodeSteps);
     let error = refuse(TaskConfig { name: "walk".to_owned(), ..default() });
     assert_eq!(error.to_string(), "task.name is \"walk\"; the only task is \"getup\"");
@@ -321,7 +322,13 @@ fn a_high_start_depends_on_its_seed_alone_and_ends_its_limp_steps_like_a_fall() 
 
 #[test]
 fn a_crouch_costs_its_share_of_the_stand_term_and_standing_nothing() {
-    let mut costly = lane(&TaskConfig { crouch_cost: 0.4, ..TaskConfig::default() });
+    for crouch_height in [1.3, 1.43] {
+        a_crouch_under(crouch_height);
+    }
+}
+
+fn a_crouch_under(crouch_height: f64) {
+    let mut costly = lane(&TaskConfig { crouch_cost: 0.4, crouch_height, ..TaskConfig::default() });
     let (mut free, mut seen) = (standard(), [0; 2]);
     for seed in 0..20 {
         costly.begin_standing(seed, 1.0);
@@ -334,11 +341,11 @@ fn a_crouch_costs_its_share_of_the_stand_term_and_standing_nothing() {
             let kept = costly.terms()[0] / free.terms()[0];
             assert!((0.599..=1.0).contains(&kept) && costly.terms()[1..] == free.terms()[1..]);
             match costly.head_height() {
-                up if up > 1.45 => {
+                up if up > crouch_height + 0.02 => {
                     assert!(kept > 0.89, "{kept} at {up} m");
                     seen[0] += 1;
                 }
-                down if down < 1.3 => {
+                down if down < crouch_height - 0.13 => {
                     assert!(kept < 0.605, "{kept} at {down} m");
                     seen[1] += 1;
                 }
