@@ -20,6 +20,9 @@ use crate::run_folder::{FolderError, write_atomically};
 use crate::sac::{ActorMismatch, Sac};
 use crate::statistics::RunningStatistics;
 
+/// The buffer of the actor's average, which not every run has.
+const AVERAGE: &str = "actor.average";
+
 const FORMAT: &str = "getup-checkpoint";
 /// The version of the file's format that this program writes, and the newest it reads.
 const VERSION: u32 = 2;
@@ -148,8 +151,9 @@ fn buffers(sac: &Sac) -> [(&'static str, &Tensor); 7] {
 impl Checkpoint {
     /// Copies the state of training; the copy is the caller's to write while training goes on.
     pub fn take(sac: &Sac, curriculum: &Curriculum, progress: &Progress) -> Self {
-        let tensors =
-            buffers(sac).into_iter().map(|(name, tensor)| (name.to_owned(), to_vec(tensor))).collect();
+        let average = sac.average.iter().map(|average| (AVERAGE, average));
+        let buffers = buffers(sac).into_iter().chain(average);
+        let tensors = buffers.map(|(name, tensor)| (name.to_owned(), to_vec(tensor))).collect();
         let scalars = Scalars {
             updates: sac.updates,
             began_trained: sac.began_trained,
@@ -166,6 +170,9 @@ impl Checkpoint {
     /// Puts the networks' state into `sac`, which has the same configuration.
     pub fn restore(&self, sac: &mut Sac) -> Result<(), CheckpointError> {
         self.put(sac, |_| true)?;
+        if let (Some(average), Some(values)) = (&mut sac.average, self.tensors.get(AVERAGE)) {
+            let _ = tch::no_grad(|| average.copy_(&Tensor::from_slice(values)));
+        }
         sac.critics_adam.steps = self.scalars.critics_steps;
         sac.updates = self.scalars.updates;
         sac.began_trained = self.scalars.began_trained;
@@ -301,6 +308,13 @@ impl Checkpoint {
             tensors.insert(name.clone(), read_buffer(&file, &name).map_err(damaged)?);
         }
         tensors.insert("targets".into(), read_buffer(&file, "targets").map_err(damaged)?);
+        if file.names().contains(&AVERAGE) {
+            let average = read_buffer(&file, AVERAGE).map_err(damaged)?;
+            if average.len() != tensors["actor"].len() {
+                return Err(damaged(format!("{AVERAGE:?} is not as long as \"actor\"")));
+            }
+            tensors.insert(AVERAGE.into(), average);
+        }
         let Header { scalars, curriculum, progress, .. } = header;
         Ok(Self { tensors, scalars, curriculum, progress })
     }
@@ -383,7 +397,12 @@ mod tests {
     fn a_resumed_learner_is_bit_identical_given_the_same_minibatches() {
         let folder = tempfile::tempdir().unwrap();
         let shape = TaskShape { observation: 11, action: 4, unnormalized: vec![10] };
-        let config = SacConfig { hidden: vec![32, 32], normalize_observations: true, ..SacConfig::default() };
+        let config = SacConfig {
+            hidden: vec![32, 32],
+            normalize_observations: true,
+            actor_average: 0.1,
+            ..SacConfig::default()
+        };
         let curriculum = Curriculum::new(CurriculumConfig::default());
         let progress = Progress {
             env_steps: 1234,
@@ -403,6 +422,7 @@ mod tests {
         train(&mut resumed, &shape, 50, 100);
         let end = |sac: &Sac| Checkpoint::take(sac, &curriculum, &progress);
         assert_eq!(end(&resumed), end(&sac));
+        assert_eq!(resumed.evaluated_policy(), sac.evaluated_policy());
         assert_eq!(end(&resumed).to_bytes(), end(&sac).to_bytes());
     }
 

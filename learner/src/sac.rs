@@ -144,6 +144,8 @@ pub struct Sac {
     threads: usize,
     pub(crate) actor: Actor,
     pub(crate) actor_adam: Adam,
+    /// `[n]`: the average of the actor's weights over its updates, where the run evaluates that.
+    pub(crate) average: Option<Tensor>,
     pub(crate) critics: Critics,
     pub(crate) critics_adam: Adam,
     pub(crate) targets: Critics,
@@ -194,6 +196,7 @@ impl Sac {
             temperature_adam: ScalarAdam::new(config.temperature_lr),
             statistics: RunningStatistics::new(shape.observation, shape.unnormalized.clone()),
             config: config.clone(),
+            average: (config.actor_average > 0.0).then(|| actor.parameters.flat().copy()),
             actor,
             critics,
             rng,
@@ -208,6 +211,7 @@ impl Sac {
 
     /// The parameters were changed from outside: whatever was derived from them is made again.
     pub(crate) fn changed(&mut self) {
+        self.average = self.average.take().map(|_| self.actor.parameters.flat().copy());
         self.cpu = OnCpu::Unknown;
     }
 
@@ -421,6 +425,9 @@ impl Sac {
     fn end_update(&mut self, critic: f64, actor: f64, entropy: f64, q: f64) -> Losses {
         let gradient = self.log_temperature.exp() * (entropy - self.target_entropy);
         let floor = self.config.temperature_floor.ln();
+        if let Some(average) = &mut self.average {
+            let _ = tch::no_grad(|| average.lerp_(self.actor.parameters.flat(), self.config.actor_average));
+        }
         if self.actor_learns() {
             self.log_temperature = self.temperature_adam.step(self.log_temperature, gradient).max(floor);
         }
@@ -467,10 +474,25 @@ impl Sac {
 
     /// The actor as it is now, with the statistics that its observations are normalised by.
     pub fn policy(&self) -> Policy {
-        let values = self.actor.parameters.to_values().into_iter();
+        self.policy_of(self.actor.parameters.flat())
+    }
+
+    /// The actor that is evaluated and kept: the average over its updates, where the run has one.
+    pub fn evaluated_policy(&self) -> Policy {
+        self.policy_of(self.average.as_ref().unwrap_or(self.actor.parameters.flat()))
+    }
+
+    fn policy_of(&self, flat: &Tensor) -> Policy {
+        let values = to_vec(flat);
+        let mut rest = &values[..];
+        let tensors = self.actor.shape.tensors().into_iter().map(|(name, shape)| {
+            let (values, others) = rest.split_at(shape.iter().product());
+            rest = others;
+            (name, values.to_vec())
+        });
         Policy {
+            tensors: tensors.collect(),
             shape: self.actor.shape.clone(),
-            tensors: values.map(|(name, _, values)| (name, values)).collect(),
             statistics: self.config.normalize_observations.then(|| self.statistics.snapshot()),
             metadata: Default::default(),
         }

@@ -338,7 +338,7 @@ impl Trainer {
     pub fn finish(&mut self) -> Result<Ending, TrainError> {
         self.take_reports()?;
         let ending = self.ending.unwrap_or(Ending::Shutdown);
-        let last = self.describe(self.sac.policy(), self.curriculum.beta());
+        let last = self.describe(self.sac.evaluated_policy(), self.curriculum.beta());
         last.save(self.folder.model("last"))?;
         if ending != Ending::Shutdown {
             self.publish_final()?;

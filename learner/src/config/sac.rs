@@ -61,6 +61,10 @@ pub struct SacConfig {
     pub refill_steps: u64,
     /// Updates at the start that leave the actor as it is: for one that begins trained, with critics that do not.
     pub critics_first: u64,
+    /// Share of the new weights in an average of the actor's at every update; 0 for none. With it, the average is what is
+    /// evaluated and kept as a model, while the actor itself goes on exploring: one that sways from update to update is
+    /// better on average than at any one.
+    pub actor_average: f64,
     /// Weight of the squared distance between the actor's actions and the replay's in the actor's loss, κ; 0 for SAC.
     /// It holds a trained actor near what it did lately while critics are young, and lets it move along with the replay
     /// (Fujimoto & Gu 2021, of offline learning).
@@ -179,6 +183,7 @@ impl Default for SacConfig {
             uniform_steps: 10_000,
             refill_steps: 150_000,
             critics_first: 0,
+            actor_average: 0.0,
             anchor: 0.0,
             precision: Precision::Fp32,
             normalize_observations: false,
@@ -211,6 +216,7 @@ impl SacConfig {
             ("sac.temperature_lr", self.temperature_lr),
             ("sac.lr_final", self.lr_final),
             ("sac.weight_decay", self.weight_decay),
+            ("sac.actor_average", self.actor_average),
         ] {
             check((0.0..=1.0).contains(&rate), key, &rate, "from 0 to 1")?;
         }

@@ -203,6 +203,32 @@ fn in_bfloat16_the_learners_network_stays_within_its_rounding_of_the_actors() {
 }
 
 #[test]
+fn the_average_follows_the_actor_update_by_update_and_begins_again_with_another() {
+    let shape = TaskShape { observation: 1, action: 1, unnormalized: vec![] };
+    let config = SacConfig { actor_average: 0.3, ..toy_config() };
+    let mut sac = Sac::new(&shape, &config, 0, Device::Cpu, 1);
+    let mut rng = ChaCha8Rng::seed_from_u64(0);
+    let weights = |policy: Policy| policy.tensors.into_values().flatten().collect::<Vec<f32>>();
+    let mut expected = weights(sac.policy());
+    assert_eq!(weights(sac.evaluated_policy()), expected);
+    for _ in 0..20 {
+        sac.update(&toy_batch(64, 0.8, &mut rng)).unwrap();
+        for (average, now) in expected.iter_mut().zip(weights(sac.policy())) {
+            *average += 0.3 * (now - *average);
+        }
+    }
+    let average = weights(sac.evaluated_policy());
+    assert_ne!(average, weights(sac.policy()));
+    assert!(average.iter().zip(&expected).all(|(ours, expected)| (ours - expected).abs() < 1e-6));
+
+    let mut other = Sac::new(&shape, &config, 1, Device::Cpu, 1);
+    other.begin_with(&sac.policy()).unwrap();
+    assert!(other.is_trained() && other.evaluated_policy() == sac.policy());
+    let without = Sac::new(&shape, &toy_config(), 0, Device::Cpu, 1);
+    assert_eq!(without.evaluated_policy(), without.policy());
+}
+
+#[test]
 fn a_loss_that_is_not_a_number_stops_the_update_and_says_which() {
     let shape = TaskShape { observation: 1, action: 1, unnormalized: vec![] };
     let mut sac = Sac::new(&shape, &toy_config(), 0, Device::Cpu, 1);

@@ -20,7 +20,7 @@ impl Trainer {
         let best = self.folder.model("best");
         let policy = match self.ending {
             Some(Ending::Curriculum(_)) if best.exists() => Policy::load(best)?,
-            _ => self.describe(self.sac.policy(), self.curriculum.beta()),
+            _ => self.describe(self.sac.evaluated_policy(), self.curriculum.beta()),
         };
         self.broadcast(&policy, true);
         Ok(())
@@ -46,8 +46,12 @@ impl Trainer {
         update
     }
 
-    /// Offers a policy for evaluation.
-    pub(super) fn offer(&mut self, policy: Arc<v1::PolicyUpdate>) {
+    /// Offers the policy that was just published for evaluation, or the average in its place.
+    pub(super) fn offer(&mut self, mut policy: Arc<v1::PolicyUpdate>) {
+        if self.sac.average.is_some() {
+            let average = self.describe(self.sac.evaluated_policy(), self.curriculum.beta());
+            Arc::make_mut(&mut policy).networks[0].model = average.to_bytes().into();
+        }
         self.evaluated_updates = self.sac.updates();
         self.progress.evaluation_owed = true;
         self.hub.offer(Evaluation { policy, updates: self.sac.updates() });
