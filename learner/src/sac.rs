@@ -351,15 +351,10 @@ impl Sac {
         self.critics_adam.step(&mut self.critics.parameters, &critics_gradient);
         lap.add_to(&mut self.phases.optimizer);
 
-        // mean (α log π(a|s) − min Q(s, a) + κ Σ (a − ã)²), a ~ π(s), ã the replay's
+        // mean (α log π(a|s) − min Q(s, a)), a ~ π(s)
         let sample = self.actor.forward(&observation).sample(&beta, &noise);
         let value = self.critics.minimum(&observation, &sample.action);
-        let mut actor_loss = (&sample.log_prob * temperature - value).mean(Kind::Float);
-        if self.config.anchor > 0.0 {
-            let squares =
-                (&sample.action - &action).square().sum_dim_intlist(&[1i64][..], false, Kind::Float);
-            actor_loss += squares.mean(Kind::Float) * self.config.anchor;
-        }
+        let actor_loss = (&sample.log_prob * temperature - value).mean(Kind::Float);
         let actor = self.finite("actor", actor_loss.double_value(&[]))?;
         let actor_gradient = self.actor.parameters.gradient(&actor_loss);
         lap.add_to(&mut self.phases.actor);
@@ -391,9 +386,7 @@ impl Sac {
         let (actor, critics) = (as_slice_mut(&mut actor), as_slice_mut(&mut critics));
         let targets = as_slice_mut(&mut targets);
         let temperature = self.log_temperature.exp() as f32;
-        let anchor = self.config.anchor as f32;
-        let inputs =
-            Inputs { batch, statistics: statistics.as_ref(), next_noise, noise, temperature, anchor };
+        let inputs = Inputs { batch, statistics: statistics.as_ref(), next_noise, noise, temperature };
 
         let critic = cpu.critics_backward(&inputs, Values { actor, critics, targets });
         let critic_loss = self.finite("critic", critic.loss)?;

@@ -65,10 +65,6 @@ pub struct SacConfig {
     /// evaluated and kept as a model, while the actor itself goes on exploring: one that sways from update to update is
     /// better on average than at any one.
     pub actor_average: f64,
-    /// Weight of the squared distance between the actor's actions and the replay's in the actor's loss, κ; 0 for SAC.
-    /// It holds a trained actor near what it did lately while critics are young, and lets it move along with the replay
-    /// (Fujimoto & Gu 2021, of offline learning).
-    pub anchor: f64,
     /// Precision of the hidden layers' matrix products; weights, heads and losses are always float32.
     pub precision: Precision,
     /// Whether observations are normalised by running statistics.
@@ -184,7 +180,6 @@ impl Default for SacConfig {
             refill_steps: 150_000,
             critics_first: 0,
             actor_average: 0.0,
-            anchor: 0.0,
             precision: Precision::Fp32,
             normalize_observations: false,
             normalize_until: 300_000,
@@ -229,8 +224,6 @@ impl SacConfig {
             &floor,
             "from 0 to sac.initial_temperature",
         )?;
-        let anchor = self.anchor;
-        check(anchor >= 0.0 && anchor.is_finite(), "sac.anchor", &anchor, "0 or more")?;
         let entropy = self.target_entropy.nats(1);
         check(entropy.is_finite(), "sac.target_entropy", &entropy, "a number of nats, or \"auto\"")?;
         let exponent = self.importance_exponent;

@@ -339,18 +339,6 @@ pub(super) fn sample_gradient<'a>(
     }
 }
 
-/// Adds the gradient of `weight · Σ (a − ã)²` by the actions to `gradient`; gives the sum.
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-pub(super) fn anchor(weight: f32, actions: &[f32], anchors: &[f32], gradient: &mut [f32]) -> f64 {
-    let mut squares = 0.0;
-    for ((action, anchor), gradient) in actions.iter().zip(anchors).zip(gradient) {
-        let distance = action - anchor;
-        *gradient += 2.0 * weight * distance;
-        squares += weight * distance * distance;
-    }
-    f64::from(squares)
-}
-
 /// The factors of one step of Adam.
 #[derive(Clone, Copy)]
 pub(crate) struct AdamStep {

@@ -58,7 +58,6 @@ fn configurations() -> Vec<SacConfig> {
         simba((16, 1), (32, 2), 1),
         simba((9, 2), (17, 1), 2),
         simba((8, 0), (8, 0), 1),
-        SacConfig { anchor: 0.7, ..simba((16, 1), (32, 2), 2) },
     ]
 }
 

@@ -41,8 +41,6 @@ pub(crate) struct Inputs<'a> {
     /// `[B, action]`, standard normal.
     pub(crate) noise: &'a [f32],
     pub(crate) temperature: f32,
-    /// Weight of Σ (a − ã)² in the actor's loss, ã the minibatch's actions.
-    pub(crate) anchor: f32,
 }
 
 /// The networks' flat parameters.
@@ -57,7 +55,7 @@ pub(crate) struct Values<'a> {
 /// Sums over the minibatch that a phase found, divided by its size.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Phase {
-    /// Of the critics: Σ over critics of (Q − y)². Of the actor: α log π − min Q + κ Σ (a − ã)².
+    /// Of the critics: Σ over critics of (Q − y)². Of the actor: α log π − min Q.
     pub(crate) loss: f64,
     /// Of the critics: Q of the minibatch's actions. Of the actor: −log π.
     pub(crate) value: f64,
@@ -115,7 +113,7 @@ impl CpuUpdate {
         }
     }
 
-    /// The actor's loss and gradients: mean (α log π(a|s) − min Q(s, a) + κ Σ (a − ã)²), a ~ π(s). The minibatch is that of the last
+    /// The actor's loss and gradients: mean (α log π(a|s) − min Q(s, a)), a ~ π(s). The minibatch is that of the last
     /// [`CpuUpdate::critics_backward`].
     pub(crate) fn actor_backward(&mut self, inputs: &Inputs<'_>, values: Values<'_>) -> Phase {
         self.backward(values, |worker, networks| worker.actor_backward(networks, inputs))
@@ -245,8 +243,6 @@ struct Worker {
     next: Buffer<f32>,
     /// `[action, R]`.
     noise: Buffer<f32>,
-    /// `[action, R]`: the minibatch's actions, where the actor's loss has an anchor.
-    anchors: Buffer<f32>,
     /// `[R]` each.
     beta: Buffer<f32>,
     log_prob: Buffer<f32>,
@@ -282,7 +278,6 @@ impl Worker {
             now: memory.zeros(critic.inputs * padded),
             next: memory.zeros(critic.inputs * padded),
             noise: memory.zeros(action * padded),
-            anchors: memory.zeros(action * padded),
             beta: memory.zeros(padded),
             log_prob: memory.zeros(padded),
             value: memory.zeros(padded),
@@ -314,9 +309,6 @@ impl Worker {
         };
         load(&batch.observation, observation, &mut self.now[..split]);
         load(&batch.action, action, &mut self.now[split..]);
-        if inputs.anchor > 0.0 {
-            self.anchors.copy_from_slice(&self.now[split..]);
-        }
         load(&batch.next_observation, observation, &mut self.next[..split]);
         if let Some(ObservationStatistics { mean, std, clip }) = inputs.statistics {
             kernels::normalize(&mut self.now[..split], padded, mean, std, *clip);
@@ -391,14 +383,6 @@ impl Worker {
         }
 
         self.phase = Phase::default();
-        if inputs.anchor > 0.0 {
-            let weight = inputs.anchor * scale;
-            for index in 0..action {
-                let part = index * padded..index * padded + rows.len();
-                let (actions, anchors) = (&self.now[split..][part.clone()], &self.anchors[part.clone()]);
-                self.phase.loss += kernels::anchor(weight, actions, anchors, &mut self.action_gradient[part]);
-            }
-        }
         self.share[..rows.len()].fill(inputs.temperature * scale);
         for row in 0..rows.len() {
             let (log_prob, value) = (f64::from(self.log_prob[row]), f64::from(self.value[row]));
