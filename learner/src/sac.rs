@@ -17,6 +17,10 @@ use crate::networks::{Actor, Critics};
 use crate::parameters::{as_slice_mut, to_vec};
 use crate::statistics::RunningStatistics;
 
+mod policies;
+
+pub use policies::ActorMismatch;
+
 /// What SAC must know of the task.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TaskShape {
@@ -125,17 +129,6 @@ pub struct NonFiniteLoss {
     pub update: u64,
 }
 
-/// A model whose actor a run cannot begin with.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error(
-    "the model's {what}: {found}; the configuration's: {wanted}: begin with another model, or set [sac] as its run did"
-)]
-pub struct ActorMismatch {
-    what: &'static str,
-    found: String,
-    wanted: String,
-}
-
 /// The learner's networks with everything that training them needs.
 pub struct Sac {
     pub(crate) config: SacConfig,
@@ -213,29 +206,6 @@ impl Sac {
     pub(crate) fn changed(&mut self) {
         self.average = self.average.take().map(|_| self.actor.parameters.flat().copy());
         self.cpu = OnCpu::Unknown;
-    }
-
-    /// Puts another run's actor in the place of the untrained one, with the statistics that it learned under.
-    pub(crate) fn begin_with(&mut self, policy: &Policy) -> Result<(), ActorMismatch> {
-        let mismatch =
-            |what: &'static str, found: String, wanted: String| ActorMismatch { what, found, wanted };
-        if policy.shape != self.actor.shape {
-            let shapes = [&policy.shape, &self.actor.shape].map(|shape| format!("{shape:?}"));
-            let [found, wanted] = shapes;
-            return Err(mismatch("shape", found, wanted));
-        }
-        let normalizes = |does: bool| if does { "normalised" } else { "as they are" }.to_owned();
-        if policy.statistics.is_some() != self.config.normalize_observations {
-            let (found, wanted) = (policy.statistics.is_some(), self.config.normalize_observations);
-            return Err(mismatch("observations", normalizes(found), normalizes(wanted)));
-        }
-        self.actor = Actor::new(policy, self.config.precision.kind(self.device), self.device);
-        if let Some(statistics) = &policy.statistics {
-            self.statistics.begin_with(statistics);
-        }
-        self.began_trained = true;
-        self.changed();
-        Ok(())
     }
 
     /// Updates made so far.
@@ -463,32 +433,6 @@ impl Sac {
             );
         }
         self.cpu = update.map_or(OnCpu::Absent, |update| OnCpu::Ready(Box::new(update)));
-    }
-
-    /// The actor as it is now, with the statistics that its observations are normalised by.
-    pub fn policy(&self) -> Policy {
-        self.policy_of(self.actor.parameters.flat())
-    }
-
-    /// The actor that is evaluated and kept: the average over its updates, where the run has one.
-    pub fn evaluated_policy(&self) -> Policy {
-        self.policy_of(self.average.as_ref().unwrap_or(self.actor.parameters.flat()))
-    }
-
-    fn policy_of(&self, flat: &Tensor) -> Policy {
-        let values = to_vec(flat);
-        let mut rest = &values[..];
-        let tensors = self.actor.shape.tensors().into_iter().map(|(name, shape)| {
-            let (values, others) = rest.split_at(shape.iter().product());
-            rest = others;
-            (name, values.to_vec())
-        });
-        Policy {
-            tensors: tensors.collect(),
-            shape: self.actor.shape.clone(),
-            statistics: self.config.normalize_observations.then(|| self.statistics.snapshot()),
-            metadata: Default::default(),
-        }
     }
 
     fn normalize(&self, observation: &Tensor) -> Tensor {
