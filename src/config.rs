@@ -165,7 +165,7 @@ impl Default for Config {
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct ConfigArgs {
     /// Settings to start from: `smoke` (a minute, for tests), `laptop` (two to eight cores), `standing` (with `--from`:
-    /// what laptop learned learns to stay up), `paper` (Table 1 of the paper to the letter), `gpu`. [default: laptop]
+    /// what gets up learns to stay up), `paper` (Table 1 of the paper to the letter), `gpu`. [default: laptop]
     #[arg(long, value_name = "NAME")]
     pub(crate) preset: Option<String>,
     /// A configuration file over the preset, such as a run's own config.toml.
