@@ -171,7 +171,7 @@ impl Checkpoint {
     pub fn restore(&self, sac: &mut Sac) -> Result<(), CheckpointError> {
         self.put(sac, |_| true)?;
         if let (Some(average), Some(values)) = (&mut sac.average, self.tensors.get(AVERAGE)) {
-            let _ = tch::no_grad(|| average.copy_(&Tensor::from_slice(values)));
+            tch::no_grad(|| average.copy_(&Tensor::from_slice(values)));
         }
         sac.critics_adam.steps = self.scalars.critics_steps;
         sac.updates = self.scalars.updates;
