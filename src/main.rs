@@ -4,6 +4,7 @@
 //! `getup-actor`, `getup-learner`, `getup-replay`, `getup-sim`.
 
 mod actor;
+mod average;
 mod bench;
 mod certs;
 mod chaos;
@@ -52,6 +53,7 @@ enum Command {
     Learner(learner::Args),
     Actor(actor::Args),
     Evaluate(evaluate::Args),
+    Average(average::Args),
     #[cfg(feature = "render")]
     Render(render::Args),
     Rollout(rollout::Args),
@@ -75,6 +77,7 @@ fn main() -> ExitCode {
         Command::Learner(arguments) => learner::run(arguments),
         Command::Actor(arguments) => actor::run(arguments),
         Command::Evaluate(arguments) => evaluate::run(arguments),
+        Command::Average(arguments) => average::run(arguments),
         #[cfg(feature = "render")]
         Command::Render(arguments) => render::run(arguments),
         Command::Rollout(arguments) => rollout::run(arguments),

@@ -130,6 +130,43 @@ fn a_run_goes_on_without_its_replay_and_another_begins_with_its_networks() {
 }
 
 #[test]
+fn models_of_one_ancestor_are_averaged_into_one_that_is_evaluated() {
+    let folder = tempfile::tempdir().unwrap();
+    succeed(&mut train(folder.path(), &["--run", "a", "--steps", "600"]));
+    for (run, seed) in [("b", "1"), ("c", "2")] {
+        let from = ["--run", run, "--seed", seed, "--from", "a/models/last.safetensors", "--steps", "1"];
+        succeed(train(folder.path(), &from).args(["--set", "curriculum.fixed=true"]));
+    }
+    let average = |models: &[&str], output: &str| {
+        let mut command = getup(&["average"]);
+        command.args(models).args(["--output", output]).current_dir(folder.path());
+        command
+    };
+    let [b, c] = ["b/models/last.safetensors", "c/models/last.safetensors"];
+    let said = succeed(&mut average(&[b, c], "mean.safetensors"));
+    assert!(said.contains("The mean of 2 models is in mean.safetensors"), "{said}");
+    let evaluate = ["evaluate", "mean.safetensors", "--episodes", "2", "--json"];
+    let report: Value = serde_json::from_str(&succeed(getup(&evaluate).current_dir(folder.path()))).unwrap();
+    assert_eq!(report["beta"], 1.0);
+
+    let wider = ["--run", "wider", "--steps", "600", "--set", "sac.hidden=[8, 8]"];
+    succeed(&mut train(folder.path(), &wider));
+    for (models, output, expected) in [
+        (
+            vec![b, "wider/models/last.safetensors"],
+            "m.safetensors",
+            "wider/models/last.safetensors: policy 1 has another shape",
+        ),
+        (vec![b, "nowhere.safetensors"], "m.safetensors", "nowhere.safetensors"),
+        (vec![b, c], b, "is one of the models"),
+        (vec![b], "m.safetensors", "2 values required"),
+    ] {
+        let error = fail(&mut average(&models, output));
+        assert!(error.contains(expected), "{error}");
+    }
+}
+
+#[test]
 fn a_strip_of_frames_is_a_picture_of_the_size_asked_for() {
     let folder = tempfile::tempdir().unwrap();
     succeed(&mut train(folder.path(), &["--run", "run", "--steps", "600"]));

@@ -16,7 +16,7 @@ mod layer;
 mod shape;
 mod statistics;
 
-pub use file::{ModelError, Policy};
+pub use file::{MeanError, ModelError, Policy};
 pub use forward::{Forward, Heads, squash};
 pub use shape::{Body, LOG_STD_MAX, LOG_STD_MIN, NORM_EPSILON, PolicyShape};
 pub use statistics::ObservationStatistics;

@@ -1,8 +1,8 @@
 //! The policy against a plain reference, and its file against damage.
 
 use getup_policy::{
-    Body, Forward, LOG_STD_MAX, LOG_STD_MIN, ModelError, NORM_EPSILON, ObservationStatistics, Policy,
-    PolicyShape,
+    Body, Forward, LOG_STD_MAX, LOG_STD_MIN, MeanError, ModelError, NORM_EPSILON, ObservationStatistics,
+    Policy, PolicyShape,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -175,4 +175,35 @@ fn damage_is_named_and_never_a_panic() {
     let at = newer.windows(needle.len()).position(|window| window == needle).unwrap();
     newer[at + needle.len() - 1] = b'9';
     assert!(matches!(Policy::from_bytes(&newer), Err(ModelError::Version { found: 9 })));
+}
+
+#[test]
+fn a_mean_is_taken_weight_by_weight_of_what_is_alike() {
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let shape = shapes().remove(0);
+    let mut policies: Vec<Policy> = (0..3).map(|_| random_policy(shape.clone(), &mut rng)).collect();
+    for index in 1..3 {
+        policies[index].statistics = policies[0].statistics.clone();
+    }
+    let mean = Policy::mean(&policies).unwrap();
+    for (name, values) in &mean.tensors {
+        for (place, value) in values.iter().enumerate() {
+            let sum: f32 = policies.iter().map(|policy| policy.tensors[name][place]).sum();
+            assert!((value - sum / 3.0).abs() < 1e-6, "{name}[{place}]");
+        }
+    }
+    assert_eq!((&mean.metadata, &mean.statistics), (&policies[0].metadata, &policies[0].statistics));
+    assert_eq!(Policy::mean(&policies[..1]).unwrap(), policies[0]);
+    assert_eq!(Policy::mean(&[]), Err(MeanError::None));
+
+    let other = random_policy(shapes().remove(1), &mut rng);
+    let differs = |what| Err(MeanError::Differs { index: 1, what });
+    assert_eq!(Policy::mean(&[policies[0].clone(), other]), differs("shape"));
+    let statistics = policies[0].statistics.is_none().then(|| getup_policy::ObservationStatistics {
+        mean: vec![0.0; shape.observation],
+        std: vec![1.0; shape.observation],
+        clip: 10.0,
+    });
+    let other = Policy { statistics, ..policies[1].clone() };
+    assert_eq!(Policy::mean(&[policies[0].clone(), other]), differs("observation statistics"));
 }

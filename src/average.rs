@@ -1,0 +1,44 @@
+//! `getup average`: one controller from several of one ancestor.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, ensure};
+use getup_policy::{MeanError, Policy};
+
+/// What an evaluation said of one of them it did not say of their mean.
+const OF_ONE: &str = "evaluation_";
+
+/// Average the weights of models of one ancestor into one model.
+///
+/// Runs that went on from the same checkpoint, or one run at several times, each sway about what they have in common:
+/// their mean is often better than each. Evaluate it; models of different ancestors average to nothing.
+#[derive(clap::Args)]
+pub(crate) struct Args {
+    /// Two or more model files.
+    #[arg(required = true, num_args = 2.., value_name = "MODEL")]
+    models: Vec<PathBuf>,
+    /// The file to write.
+    #[arg(long, value_name = "FILE")]
+    output: PathBuf,
+}
+
+pub(crate) fn run(arguments: Args) -> Result<()> {
+    let load = |path: &PathBuf| Policy::load(path).with_context(|| path.display().to_string());
+    let policies: Vec<Policy> = arguments.models.iter().map(load).collect::<Result<_>>()?;
+    let mut mean = Policy::mean(&policies).map_err(|error| match error {
+        MeanError::Differs { index, .. } => {
+            anyhow::Error::new(error).context(arguments.models[index].display().to_string())
+        }
+        MeanError::None => error.into(),
+    })?;
+    mean.metadata.retain(|key, _| !key.starts_with(OF_ONE));
+    mean.metadata.insert("average_of".into(), policies.len().to_string());
+    let shown = arguments.output.display();
+    ensure!(
+        !arguments.models.contains(&arguments.output),
+        "--output {shown} is one of the models: name another"
+    );
+    mean.save(&arguments.output)?;
+    println!("The mean of {} models is in {shown}. Try it: getup evaluate {shown}", policies.len());
+    Ok(())
+}
