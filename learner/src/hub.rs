@@ -48,7 +48,7 @@ pub struct Evaluation {
 /// What the training thread tells of itself.
 #[derive(Clone, Debug, Default)]
 pub struct Standing {
-    /// "waiting", "training", "finished".
+    /// "waiting", "filling" (the replay, before the updates of a trained actor go on), "training", "finished".
     pub state: &'static str,
     /// Env steps of the run.
     pub env_steps: u64,

@@ -389,6 +389,7 @@ impl Trainer {
         self.metrics.finished.set(i64::from(self.ending.is_some()));
         let state = match self.ending {
             Some(_) => "finished",
+            None if self.refill.is_going_on() => "filling",
             None if self.sac.updates() == 0 => "waiting",
             None => "training",
         };

@@ -95,18 +95,11 @@ impl Display {
 
     fn describe(&mut self, standing: &Standing) -> String {
         let mut parts = vec![format!("{} updates", standing.updates)];
-        if standing.updates > 0 {
-            let (since, from) = *self.first.get_or_insert((Instant::now(), standing.env_steps));
-            let seconds = since.elapsed().as_secs_f64();
-            let per_second = (standing.env_steps - from) as f64 / seconds.max(1e-9);
-            parts.push(format!("{:.0} updates/s, {per_second:.0} env steps/s", standing.updates_per_second));
-            parts.push(format!("stage {} β {:.2}", standing.stage, standing.beta));
-            let left = self.steps.saturating_sub(standing.env_steps) as f64 / per_second;
-            if self.steps > 0 && left.is_finite() {
-                parts.push(format!("{} left", human(left)));
-            }
-        } else {
-            parts.push(format!("first {} env steps of uniform actions", self.uniform_steps));
+        match standing.state {
+            // How far, its wait says.
+            "filling" => {}
+            _ if standing.updates == 0 => parts.push(format!("the first {} env steps", self.uniform_steps)),
+            _ => self.describe_pace(standing, &mut parts),
         }
         if let Some(evaluation) = &standing.evaluation {
             let [rises, stands] = [evaluation.rises, evaluation.stands].map(|share| 100.0 * share);
@@ -120,6 +113,18 @@ impl Display {
             parts.push(wait.to_string());
         }
         parts.join(" · ")
+    }
+
+    fn describe_pace(&mut self, standing: &Standing, parts: &mut Vec<String>) {
+        let (since, from) = *self.first.get_or_insert((Instant::now(), standing.env_steps));
+        let seconds = since.elapsed().as_secs_f64();
+        let per_second = (standing.env_steps - from) as f64 / seconds.max(1e-9);
+        parts.push(format!("{:.0} updates/s, {per_second:.0} env steps/s", standing.updates_per_second));
+        parts.push(format!("stage {} β {:.2}", standing.stage, standing.beta));
+        let left = self.steps.saturating_sub(standing.env_steps) as f64 / per_second;
+        if self.steps > 0 && left.is_finite() {
+            parts.push(format!("{} left", human(left)));
+        }
     }
 }
 

@@ -24,6 +24,11 @@ impl Refill {
         Self { share: steps / replays, replays, wanted: BTreeMap::new(), wait: None }
     }
 
+    /// Whether any replay is being filled.
+    pub(super) fn is_going_on(&self) -> bool {
+        self.wait.is_some()
+    }
+
     /// Whether a minibatch of that replay comes too early.
     ///
     /// `made` are the env steps of the run so far, none where its actor is untrained: a replay that is new to the learner
