@@ -215,7 +215,8 @@ impl Sac {
 
     /// Whether any update was made, by this run or by the one whose networks it begins with.
     pub fn is_trained(&self) -> bool {
-        self.updates > 0 || self.began_trained
+        // Checkpoints from before `began_trained` count its actor's steps.
+        self.updates > 0 || self.began_trained || self.actor_adam.steps > 0
     }
 
     /// Sets the learning rates of actor and critics for `env_steps` of the run.

@@ -74,8 +74,8 @@ enum Command {
     /// Draw the figures in `docs/` from the runs in `docs/runs/`.
     ///
     /// To show a run, copy its config.toml, evaluations.jsonl and timings.jsonl to docs/runs/NAME-SEED/, such as
-    /// docs/runs/laptop-1/. They become docs/learning-curve.png and docs/torque-limit.png; a run in docs/runs/standing/
-    /// becomes docs/standing.png, and the runs of `cargo xtask ablate` docs/ablation.png; docs/fleet.png is from what
+    /// docs/runs/laptop-1/. They become docs/learning-curve.png and docs/torque-limit.png; the runs docs/runs/standing*
+    /// become docs/standing.png, and the runs of `cargo xtask ablate` docs/ablation.png; docs/fleet.png is from what
     /// `GETUP_FLEET_RECORD=1 cargo xtask bench fleet` writes. A figure without a run is left out, and said to be. The
     /// first time installs matplotlib into .native/plots/.
     Plot,

@@ -35,6 +35,10 @@ impl Refill {
     /// has to hold its part of them, or of the configured ones where these are fewer.
     pub(super) fn goes_on(&mut self, counters: &ReplayCounters, made: u64, waits: &Waits) -> bool {
         let part = self.share.min(made / self.replays);
+        if !self.wanted.contains_key(&counters.store) && self.wanted.len() as u64 >= self.replays {
+            // It is in the place of another, which may have been lost before it was full. One that was not comes anew.
+            self.wanted.retain(|_, wanted| *wanted == 0);
+        }
         let entry = self.wanted.entry(counters.store).or_insert(part);
         if counters.held >= *entry {
             *entry = 0;
@@ -76,6 +80,15 @@ mod tests {
         assert!(waits.current().is_empty());
         assert!(!refill.goes_on(&held(7, 3), u64::MAX, &waits), "removed since");
         assert!(refill.goes_on(&held(8, 3), u64::MAX, &waits), "another in its place");
+    }
+
+    #[test]
+    fn a_replay_that_is_lost_before_it_is_full_is_not_waited_for() {
+        let waits = Waits::new(&Registry::new());
+        let mut refill = Refill::new(1000, 1);
+        assert!(refill.goes_on(&held(7, 1), u64::MAX, &waits));
+        assert!(refill.goes_on(&held(8, 1), u64::MAX, &waits) && refill.is_going_on());
+        assert!(!refill.goes_on(&held(8, 1000), u64::MAX, &waits) && !refill.is_going_on());
     }
 
     #[test]
