@@ -7,12 +7,8 @@
 use getup_policy::NORM_EPSILON;
 use multiversion::multiversion;
 
-use super::layout::Rows;
+use super::layout::LANES;
 use super::math;
-use super::operand::Numbers;
-
-/// Numbers of the widest vector; R is a multiple of it.
-pub(super) const LANES: usize = 16;
 
 /// Adds a number to every row.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
@@ -42,113 +38,62 @@ pub(super) fn copy_with_bias(from: &[f32], bias: &[f32], rows: usize, to: &mut [
     }
 }
 
-/// A matrix, `[F, R]`, plus a number for every row, as far as it is positive.
-pub(super) struct BiasRelu<'a> {
-    pub(super) values: &'a [f32],
-    pub(super) bias: &'a [f32],
-    pub(super) rows: usize,
-}
-
-impl Rows for BiasRelu<'_> {
-    #[inline(always)]
-    fn lanes(&mut self, row: usize, at: usize) -> [f32; LANES] {
-        let bias = self.bias[row];
-        lanes(self.values, row * self.rows + at).map(|value| {
-            let sum = value + bias;
-            // As above: NaN stays NaN.
-            if sum < 0.0 { 0.0 } else { sum }
-        })
-    }
-}
-
-/// The gradient of a layer's result, `[F, R]`, where its ReLU let through; and its sums, which are the gradient of the
-/// layer's bias.
-pub(super) struct Gradient<'a> {
-    values: &'a [f32],
-    /// The ReLU's result, where the layer has one.
-    result: Option<Numbers<'a>>,
-    rows: usize,
-    /// `[F]`, where they are asked for.
-    sums: Option<&'a mut [f32]>,
-    /// Of the row that is being read.
-    sum: [f32; LANES],
-}
-
-impl<'a> Gradient<'a> {
-    pub(super) fn new(
-        values: &'a [f32],
-        result: Option<Numbers<'a>>,
-        rows: usize,
-        sums: Option<&'a mut [f32]>,
-    ) -> Self {
-        Self { values, result, rows, sums, sum: [0.0; LANES] }
-    }
-}
-
-impl Rows for Gradient<'_> {
-    #[inline(always)]
-    fn lanes(&mut self, row: usize, at: usize) -> [f32; LANES] {
-        let start = row * self.rows + at;
-        let mut values = lanes(self.values, start);
-        match self.result {
-            None => {}
-            Some(Numbers::F32(result)) => {
-                let result = lanes(result, start);
-                (0..LANES)
-                    .for_each(|lane| values[lane] = if result[lane] > 0.0 { values[lane] } else { 0.0 });
-            }
-            Some(Numbers::Bf16(result)) => {
-                let result: [u16; LANES] = lanes(result, start);
-                // Not zero and no sign: a NaN may pass.
-                let positive = |bits: u16| bits.wrapping_sub(1) < 0x7fff;
-                (0..LANES)
-                    .for_each(|lane| values[lane] = if positive(result[lane]) { values[lane] } else { 0.0 });
-            }
-        }
-        (0..LANES).for_each(|lane| self.sum[lane] += values[lane]);
-        values
-    }
-
-    #[inline(always)]
-    fn end(&mut self, row: usize) {
-        if let Some(sums) = &mut self.sums {
-            sums[row] = total(&self.sum);
-        }
-        self.sum = [0.0; LANES];
-    }
-}
-
 /// `N` numbers of a matrix whose rows are whole lanes.
 #[inline(always)]
 fn part<T, const N: usize>(values: &[T], start: usize) -> &[T; N] {
     values[start..].first_chunk().expect("rows are whole lanes")
 }
 
-#[inline(always)]
-fn lanes<T: Copy>(values: &[T], start: usize) -> [T; LANES] {
-    *part(values, start)
-}
-
 /// The sum of every row: the gradient of a bias.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 pub(super) fn row_sums(values: &[f32], rows: usize, sums: &mut [f32]) {
     for (row, sum) in values.chunks_exact(rows).zip(sums) {
-        let mut lanes = [0.0f32; LANES];
-        for part in row.chunks_exact(LANES) {
-            (0..LANES).for_each(|lane| lanes[lane] += part[lane]);
-        }
-        *sum = total(&lanes);
+        *sum = row_sum(row);
     }
 }
 
-/// The sum of partial sums, in a fixed order.
-#[inline(always)]
-fn total(lanes: &[f32; LANES]) -> f32 {
-    let mut lanes = *lanes;
-    for half in [8, 4, 2, 1] {
-        (0..half).for_each(|lane| lanes[lane] += lanes[lane + half]);
+/// The sum of squares, in a fixed order.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
+pub(super) fn squares(values: &[f32]) -> f32 {
+    let (parts, rest) = values.as_chunks::<{ 4 * LANES }>();
+    let mut sums = [0.0f32; 4 * LANES];
+    for part in parts {
+        for i in 0..4 * LANES {
+            sums[i] += part[i] * part[i];
+        }
     }
-    lanes[0]
+    total(&sums) + rest.iter().map(|value| value * value).sum::<f32>()
+}
+
+/// The sum of numbers, in a fixed order.
+#[inline(always)]
+pub(super) fn row_sum(values: &[f32]) -> f32 {
+    let (parts, rest) = values.as_chunks::<{ 4 * LANES }>();
+    let mut sums = [0.0f32; 4 * LANES];
+    for part in parts {
+        for i in 0..4 * LANES {
+            sums[i] += part[i];
+        }
+    }
+    for (sum, value) in sums.iter_mut().zip(rest) {
+        *sum += value;
+    }
+    total(&sums)
+}
+
+/// The sum of partial sums, in a fixed order. On its own: what is inlined around it would else be compiled to vectors of
+/// its last steps.
+#[inline(never)]
+fn total<const N: usize>(sums: &[f32; N]) -> f32 {
+    let mut sums = *sums;
+    let mut length = N;
+    while length > 1 {
+        length /= 2;
+        for i in 0..length {
+            sums[i] += sums[i + length];
+        }
+    }
+    sums[0]
 }
 
 /// What a layer norm needs to know of every transition: `mean` over the features, and `inverse` = 1 / √(variance + ε),
@@ -170,29 +115,6 @@ pub(super) fn moments(x: &[f32], mean: &mut [f32], inverse: &mut [f32]) {
         }
     }
     inverse.iter_mut().for_each(|sum| *sum = 1.0 / (*sum * scale + NORM_EPSILON).sqrt());
-}
-
-/// A layer norm over the features of every transition: `normal = (x − mean) / √(variance + ε)`, which is kept, and
-/// `normal · weight + bias`.
-pub(super) struct Normal<'a> {
-    pub(super) x: &'a [f32],
-    pub(super) mean: &'a [f32],
-    pub(super) inverse: &'a [f32],
-    pub(super) weight: &'a [f32],
-    pub(super) bias: &'a [f32],
-    pub(super) normal: &'a mut [f32],
-}
-
-impl Rows for Normal<'_> {
-    #[inline(always)]
-    fn lanes(&mut self, row: usize, at: usize) -> [f32; LANES] {
-        let start = row * self.mean.len() + at;
-        let [mut x, mean, inverse] = [lanes(self.x, start), lanes(self.mean, at), lanes(self.inverse, at)];
-        (0..LANES).for_each(|lane| x[lane] = (x[lane] - mean[lane]) * inverse[lane]);
-        self.normal[start..start + LANES].copy_from_slice(&x);
-        let (weight, bias) = (self.weight[row], self.bias[row]);
-        x.map(|normal| normal * weight + bias)
-    }
 }
 
 /// Adds the gradient of a layer norm's input to `to`, given that of its result. `parameters` receives the gradients
@@ -336,48 +258,6 @@ pub(super) fn sample_gradient<'a>(
         let by_u = share[i] * 2.0 * tanh + action[i] * beta[i] * (1.0 - tanh * tanh);
         mean_gradient[i] = by_u;
         log_std_gradient[i] = (by_u * spread - share[i]) * HALF_RANGE * (1.0 - squashed * squashed);
-    }
-}
-
-/// The factors of one step of Adam.
-#[derive(Clone, Copy)]
-pub(crate) struct AdamStep {
-    /// Learning rate over the first moment's bias correction.
-    pub(crate) rate: f32,
-    /// The inverse root of the second moment's bias correction.
-    pub(crate) root: f32,
-    /// Share of every parameter that decays: learning rate × weight decay.
-    pub(crate) decay: f32,
-    pub(crate) beta1: f32,
-    pub(crate) beta2: f32,
-    pub(crate) epsilon: f32,
-}
-
-/// One step of AdamW (Loshchilov & Hutter 2019) on a run of parameters.
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-pub(super) fn adam(
-    step: AdamStep,
-    values: &mut [f32],
-    gradient: &[f32],
-    first: &mut [f32],
-    second: &mut [f32],
-) {
-    let length = values.len();
-    let (gradient, first, second) = (&gradient[..length], &mut first[..length], &mut second[..length]);
-    for i in 0..length {
-        let g = gradient[i];
-        first[i] = step.beta1 * first[i] + (1.0 - step.beta1) * g;
-        second[i] = step.beta2 * second[i] + (1.0 - step.beta2) * g * g;
-        let change = step.rate * first[i] / (second[i].sqrt() * step.root + step.epsilon);
-        values[i] = values[i] - step.decay * values[i] - change;
-    }
-}
-
-/// `target ← target + τ (source − target)`, Polyak averaging.
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-pub(super) fn polyak(target: &mut [f32], source: &[f32], tau: f32) {
-    for (target, source) in target.iter_mut().zip(source) {
-        *target += tau * (source - *target);
     }
 }
 

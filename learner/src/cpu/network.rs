@@ -1,22 +1,25 @@
-//! A body with its heads, forward and backward, on the layouts of `operand`.
+//! A body with its heads, forward and backward, on what [`super::factors`] and [`super::weights`] lay out.
 //!
-//! A [`Network`] is the shape and where each parameter lies in the flat buffer; [`Trace`] is what one pass over R
+//! A [`Network`] is the shape and where each parameter lies in the flat buffer; a [`Trace`] is what one pass over R
 //! transitions leaves for its way back. Nothing is allocated in a pass.
 
 use std::ops::Range;
 
 use getup_policy::Body;
 
-use super::kernels::{self, BiasRelu, Gradient, Normal};
-use super::layout::{self, AsTheyAre};
-use super::memory::{Buffer, Memory};
-use super::operand::{Numbers, Operand, Weights, weight_gradient, weight_gradient_transposed};
+use super::factors::{Factors, Purpose, Right};
+use super::kernels;
+use super::layout::{self, CHUNK, chunks};
+use super::memory::Memory;
 use super::product::Format;
+use super::rows::{AsTheyAre, BiasRelu, Gradient, Normal, Passed};
+use super::trace::{SavedNorm, Scratch, Trace, features};
+use super::weights::Weights;
 
 /// `y = W·x + b`.
 #[derive(Clone, Debug)]
 pub(super) struct Linear {
-    format: Format,
+    pub(super) format: Format,
     pub(super) inputs: usize,
     pub(super) outputs: usize,
     /// Where `W` and then `b` lie.
@@ -25,14 +28,14 @@ pub(super) struct Linear {
 
 /// A layer norm.
 #[derive(Clone, Debug)]
-struct Norm {
-    width: usize,
+pub(super) struct Norm {
+    pub(super) width: usize,
     /// Where weight and then bias lie.
     range: Range<usize>,
 }
 
 #[derive(Clone, Debug)]
-enum Layer {
+pub(super) enum Layer {
     Dense { linear: Linear, relu: bool },
     Block { norm: Norm, up: Linear, down: Linear },
     Norm(Norm),
@@ -41,10 +44,9 @@ enum Layer {
 /// A body and its heads over one flat run of parameters.
 #[derive(Clone, Debug)]
 pub(super) struct Network {
-    layers: Vec<Layer>,
-    heads: Vec<Linear>,
+    pub(super) layers: Vec<Layer>,
+    pub(super) heads: Vec<Linear>,
     pub(super) inputs: usize,
-    pub(super) width: usize,
     /// Numbers in all parameters.
     pub(super) length: usize,
 }
@@ -123,11 +125,11 @@ impl Network {
         }
         let width = body.output_width(inputs);
         let heads = heads.iter().map(|outputs| linear(Format::F32, width, *outputs)).collect();
-        Self { layers, heads, inputs, width, length }
+        Self { layers, heads, inputs, length }
     }
 
     /// All linear layers, in the order of their parameters.
-    fn linears(&self) -> impl Iterator<Item = &Linear> {
+    pub(super) fn linears(&self) -> impl Iterator<Item = &Linear> {
         let body = self.layers.iter().flat_map(|layer| match layer {
             Layer::Dense { linear, .. } => vec![linear],
             Layer::Block { up, down, .. } => vec![up, down],
@@ -136,22 +138,41 @@ impl Network {
         body.chain(&self.heads)
     }
 
-    /// Runs of parameters that can be updated apart from each other, in order: each linear layer and each norm.
-    /// With a linear layer, the number of its weights.
-    pub(super) fn pieces(&self) -> Vec<(Range<usize>, Option<usize>)> {
-        let linear = |linear: &Linear| (linear.range.clone(), Some(linear.inputs * linear.outputs));
+    /// The layers' parameters, in order: each linear layer's and each norm's, and whether they are a linear layer's.
+    pub(super) fn pieces(&self) -> Vec<(Range<usize>, bool)> {
+        let linear = |linear: &Linear| (linear.range.clone(), true);
         let mut pieces = Vec::new();
         for layer in &self.layers {
             match layer {
                 Layer::Dense { linear: dense, .. } => pieces.push(linear(dense)),
                 Layer::Block { norm, up, down } => {
-                    pieces.extend([(norm.range.clone(), None), linear(up), linear(down)]);
+                    pieces.extend([(norm.range.clone(), false), linear(up), linear(down)]);
                 }
-                Layer::Norm(norm) => pieces.push((norm.range.clone(), None)),
+                Layer::Norm(norm) => pieces.push((norm.range.clone(), false)),
             }
         }
         pieces.extend(self.heads.iter().map(linear));
         pieces
+    }
+
+    /// Numbers in the longest gradient that is made at a time.
+    pub(super) fn longest_gradient(&self) -> usize {
+        let linear = |linear: &Linear| {
+            (linear.inputs * linear.outputs.min(Format::MOST_AT_A_TIME)).max(linear.outputs)
+        };
+        let norms = self.pieces().into_iter().filter(|(_, is_linear)| !is_linear);
+        let norms = norms.map(|(range, _)| range.len());
+        self.linears().map(linear).chain(norms).chain(self.head_weights()).max().unwrap_or(0)
+    }
+
+    /// Numbers in each head's weights.
+    pub(super) fn head_weights(&self) -> impl Iterator<Item = usize> {
+        self.heads.iter().map(|head| head.inputs * head.outputs)
+    }
+
+    /// How many of the linear layers are the body's, which come first.
+    pub(super) fn body_linears(&self) -> usize {
+        self.linears().count() - self.heads.len()
     }
 
     /// Room for the weights in the products' layout, a linear layer each, with `values` in it.
@@ -159,139 +180,208 @@ impl Network {
         let pack = |linear: &Linear| {
             let Linear { format, inputs, outputs, .. } = *linear;
             let mut weights = Weights::new(format, inputs, outputs, differentiated, memory);
-            let values = &values[linear.weight()];
-            weights.chunks().for_each(|(first, range)| weights.pack(first, &values[range]));
+            let mut values = AsTheyAre { first: 0, values: &values[linear.weight()], length: inputs };
+            for part in &mut weights.parts {
+                chunks(part.outputs.clone(), CHUNK).for_each(|outputs| part.pack(outputs, &mut values));
+            }
             weights
         };
         self.linears().map(pack).collect()
     }
 
     /// Evaluates `input`, `[inputs, R]`; the heads' results are in [`Trace::outputs`].
-    pub(super) fn forward(&self, values: &[f32], weights: &[Weights], input: &[f32], trace: &mut Trace) {
-        let mut weights = weights.iter();
-        let mut next_weights = || weights.next().expect("one for every linear layer");
+    pub(super) fn forward(
+        &self,
+        values: &[f32],
+        weights: &[Weights],
+        input: &[f32],
+        trace: &mut Trace,
+        scratch: &mut Scratch,
+        purpose: Purpose,
+    ) {
+        let Trace { layers, factors, outputs, rows, .. } = trace;
+        let Scratch { product, here, there, .. } = scratch;
+        let rows = *rows;
+        let (mut weights, mut factors) = (weights.iter(), factors.iter_mut().peekable());
+        let mut next_weights = || weights.next().expect(EVERY_LINEAR);
         for (index, layer) in self.layers.iter().enumerate() {
-            let (before, after) = trace.layers.split_at_mut(index);
+            let (before, after) = layers.split_at_mut(index);
             let x: &[f32] = before.last().map_or(input, |saved| &saved.result);
-            let [saved, after @ ..] = after else { unreachable!("one for every layer") };
-            let rows = saved.rows;
+            let saved = &mut after[0];
             match layer {
                 Layer::Dense { linear, relu } => {
+                    let own = factors.next().expect(EVERY_LINEAR);
                     // The input of a later one was laid out by the ReLU before it.
                     if index == 0 {
-                        saved.input.pack(&mut AsTheyAre { values: x, length: rows });
+                        let mut x = AsTheyAre { first: 0, values: x, length: rows };
+                        own.pack_input(0..linear.inputs, &mut x, purpose, here);
                     }
-                    next_weights().apply(saved.input.right(), rows, false, &mut saved.result);
                     let bias = &values[linear.bias()];
-                    match (relu, after.first_mut()) {
-                        (true, Some(next)) => {
-                            next.input.pack(&mut BiasRelu { values: &saved.result, bias, rows });
+                    match factors.peek_mut() {
+                        Some(next) if *relu => {
+                            apply_relu(next_weights(), here, bias, next, purpose, there, product);
+                            std::mem::swap(here, there);
                         }
-                        (true, None) => kernels::add_bias_relu(&mut saved.result, bias, rows),
-                        (false, _) => kernels::add_bias(&mut saved.result, bias, rows),
+                        _ => {
+                            let all = 0..linear.outputs;
+                            next_weights().apply(all, here.words(), rows, false, &mut saved.result);
+                            match relu {
+                                true => kernels::add_bias_relu(&mut saved.result, bias, rows),
+                                false => kernels::add_bias(&mut saved.result, bias, rows),
+                            }
+                        }
                     }
                 }
                 Layer::Block { norm, up, down } => {
-                    saved.input.pack(&mut norm.forward(values, x, &mut saved.norm));
-                    next_weights().apply(saved.input.right(), rows, false, &mut saved.wide);
-                    let bias = &values[up.bias()];
-                    saved.activated.pack(&mut BiasRelu { values: &saved.wide, bias, rows });
+                    let mut normal = norm.forward(values, x, &mut saved.norm);
+                    let own = factors.next().expect(EVERY_LINEAR);
+                    own.pack_input(0..up.inputs, &mut normal, purpose, here);
+                    let wide = factors.next().expect(EVERY_LINEAR);
+                    apply_relu(next_weights(), here, &values[up.bias()], wide, purpose, there, product);
                     kernels::copy_with_bias(x, &values[down.bias()], rows, &mut saved.result);
-                    next_weights().apply(saved.activated.right(), rows, true, &mut saved.result);
+                    next_weights().apply(0..down.outputs, there.words(), rows, true, &mut saved.result);
                 }
                 Layer::Norm(norm) => {
-                    layout::write(&mut norm.forward(values, x, &mut saved.norm), rows, &mut saved.result);
+                    let mut normal = norm.forward(values, x, &mut saved.norm);
+                    layout::write(&mut normal, 0..norm.width, rows, &mut saved.result, &mut []);
                 }
             }
         }
-        let features = features(&trace.layers);
-        for (head, output) in self.heads.iter().zip(&mut trace.outputs) {
-            next_weights().apply(bytemuck::cast_slice(features), trace.rows, false, output);
-            kernels::add_bias(output, &values[head.bias()], trace.rows);
+        let features = bytemuck::cast_slice(features(layers));
+        for (head, output) in self.heads.iter().zip(outputs) {
+            next_weights().apply(0..head.outputs, features, rows, false, output);
+            kernels::add_bias(output, &values[head.bias()], rows);
         }
     }
 
     /// The way back from [`Trace::output_gradients`] after [`Network::forward`] on the same trace.
     ///
-    /// `gradient` receives the parameters' gradients, `input` those of the inputs from an index on, `[inputs − index,
-    /// R]`, added to what is there.
+    /// `gradient` receives the gradients of biases and of norms, and the trace the factors of the weights', if the pass
+    /// forward was for learning; `input` receives those of the inputs from an index on, `[inputs − index, R]`, added to what
+    /// is there.
     pub(super) fn backward(
         &self,
         values: &[f32],
         weights: &[Weights],
         trace: &mut Trace,
+        scratch: &mut Scratch,
         mut gradient: Option<&mut [f32]>,
         input: Option<(usize, &mut [f32])>,
     ) {
-        let mut weights = weights.iter().rev();
-        let mut next_weights = || weights.next().expect("one for every linear layer");
-        let Trace { layers, output_gradients, head_gradients, head_weights, front, back, wide, .. } = trace;
-        let heads = self.heads.iter().zip(output_gradients).zip(head_gradients);
-        for (index, ((head, output), operand)) in heads.rev().enumerate() {
-            operand.pack(&mut AsTheyAre { values: output, length: operand.rows });
-            if let Some(gradient) = gradient.as_deref_mut() {
-                operand.transpose();
-                let turned = &mut head_weights[..head.inputs * head.outputs];
-                weight_gradient_transposed(operand, features(layers), turned);
-                let to = bytemuck::cast_slice_mut(&mut gradient[head.weight()]);
-                layout::transpose(bytemuck::cast_slice(turned), head.inputs, head.outputs, to, head.inputs);
-                kernels::row_sums(output, operand.rows, &mut gradient[head.bias()]);
+        let Trace { layers, factors, heads, output_gradients, rows, .. } = trace;
+        let Scratch { product, here, there, front, back } = scratch;
+        let (rows, learns) = (*rows, gradient.is_some());
+        if let Some(gradient) = gradient.as_deref_mut() {
+            for ((head, output), factors) in self.heads.iter().zip(&*output_gradients).zip(heads) {
+                factors.pack_gradient(output);
+                kernels::row_sums(output, rows, &mut gradient[head.bias()]);
             }
-            next_weights().apply_transposed(operand, 0, index > 0, front);
         }
+        let (weights, head_weights) = weights.split_at(weights.len() - self.heads.len());
+        // The gradient of some of what the heads read.
+        let turn_back_heads = |features: Range<usize>, to: &mut [f32]| {
+            for (index, (weights, output)) in head_weights.iter().zip(&*output_gradients).enumerate() {
+                let output = bytemuck::cast_slice(output);
+                weights.apply_transposed(features.clone(), output, rows, index > 0, to);
+            }
+        };
+        let mut weights = weights.iter().rev();
+        let mut next_weights = || weights.next().expect(EVERY_LINEAR);
+        // Those of the layers before.
+        let mut factors = &mut factors[..];
         for (index, layer) in self.layers.iter().enumerate().rev() {
-            let [saved, after @ ..] = &mut layers[index..] else { unreachable!("one for every layer") };
-            let rows = saved.rows;
+            let saved = &layers[index];
             match layer {
                 Layer::Norm(norm) => {
-                    back[..saved.result.len()].fill(0.0);
-                    norm.backward(values, &saved.norm, front, back, gradient.as_deref_mut());
-                    std::mem::swap(front, back);
-                }
-                Layer::Block { norm, up, down } => {
-                    let sums = gradient.as_deref_mut().map(|gradient| &mut gradient[down.bias()]);
-                    saved.result_gradient.pack(&mut Gradient::new(front, None, rows, sums));
-                    if let Some(gradient) = gradient.as_deref_mut() {
-                        saved.activated.transpose();
-                        let to = &mut gradient[down.weight()];
-                        weight_gradient(&saved.result_gradient, &saved.activated, to);
-                    }
-                    let wide = &mut wide[..saved.wide.len()];
-                    next_weights().apply_transposed(&saved.result_gradient, 0, false, wide);
-                    let sums = gradient.as_deref_mut().map(|gradient| &mut gradient[up.bias()]);
-                    let result = Some(saved.activated.numbers());
-                    saved.wide_gradient.pack(&mut Gradient::new(wide, result, rows, sums));
-                    if let Some(gradient) = gradient.as_deref_mut() {
-                        saved.input.transpose();
-                        weight_gradient(&saved.wide_gradient, &saved.input, &mut gradient[up.weight()]);
-                    }
-                    next_weights().apply_transposed(&saved.wide_gradient, 0, false, back);
+                    turn_back_heads(0..norm.width, back);
+                    front[..saved.result.len()].fill(0.0);
                     norm.backward(values, &saved.norm, back, front, gradient.as_deref_mut());
                 }
+                Layer::Block { norm, up, down } => {
+                    let [before @ .., own, wide] = factors else { unreachable!("{EVERY_LINEAR}") };
+                    let sums = gradient.as_deref_mut().map(|gradient| &mut gradient[down.bias()]);
+                    let mut whole = Gradient { first: 0, values: front, passed: Passed::All, rows, sums };
+                    wide.pack_gradient(0..down.outputs, &mut whole, learns, here);
+                    let sums = gradient.as_deref_mut().map(|gradient| &mut gradient[up.bias()]);
+                    turn_back_relu(next_weights(), here, wide.passed(), own, sums, there, product);
+                    next_weights().apply_transposed(0..up.inputs, there.words(), rows, false, back);
+                    norm.backward(values, &saved.norm, back, front, gradient.as_deref_mut());
+                    factors = before;
+                }
                 Layer::Dense { linear, relu } => {
-                    let result = match after.first() {
-                        _ if !relu => None,
-                        Some(next) => Some(next.input.numbers()),
-                        None => Some(Numbers::F32(&saved.result)),
-                    };
-                    let sums = gradient.as_deref_mut().map(|gradient| &mut gradient[linear.bias()]);
-                    saved.result_gradient.pack(&mut Gradient::new(front, result, rows, sums));
-                    if let Some(gradient) = gradient.as_deref_mut() {
-                        saved.input.transpose();
-                        let to = &mut gradient[linear.weight()];
-                        weight_gradient(&saved.result_gradient, &saved.input, to);
+                    let [before @ .., own] = factors else { unreachable!("{EVERY_LINEAR}") };
+                    // The gradient of an earlier one's result was laid out by the one after it.
+                    let mut sums = gradient.as_deref_mut().map(|gradient| &mut gradient[linear.bias()]);
+                    if !relu {
+                        let mut whole = Gradient { first: 0, values: front, passed: Passed::All, rows, sums };
+                        own.pack_gradient(0..linear.outputs, &mut whole, learns, here);
+                    } else if index + 1 == self.layers.len() {
+                        for features in chunks(0..linear.outputs, Format::F32.at_a_time(1, rows)) {
+                            let values = &mut product[..features.len() * rows];
+                            turn_back_heads(features.clone(), values);
+                            let (passed, sums) = (Passed::Positive(&saved.result), sums.as_deref_mut());
+                            let mut chunk = Gradient { first: features.start, values, passed, rows, sums };
+                            own.pack_gradient(features, &mut chunk, learns, here);
+                        }
                     }
-                    let weights = next_weights();
-                    if index > 0 {
-                        weights.apply_transposed(&saved.result_gradient, 0, false, back);
-                        std::mem::swap(front, back);
-                    } else if let Some((first, to)) = input {
-                        weights.apply_transposed(&saved.result_gradient, first, true, to);
-                        return;
+                    match (before.last_mut(), self.layers[..index].last()) {
+                        (Some(before), Some(Layer::Dense { linear, .. })) => {
+                            let sums = gradient.as_deref_mut().map(|gradient| &mut gradient[linear.bias()]);
+                            turn_back_relu(next_weights(), here, own.passed(), before, sums, there, product);
+                            std::mem::swap(here, there);
+                        }
+                        _ => {
+                            let Some((first, to)) = input else { return };
+                            let inputs = first..linear.inputs;
+                            next_weights().apply_transposed(inputs, here.words(), rows, true, to);
+                            return;
+                        }
                     }
+                    factors = before;
                 }
             }
         }
+    }
+}
+
+const EVERY_LINEAR: &str = "there is one for every linear layer";
+
+/// `max(W·x + bias, 0)`, laid out as it is made for the layer whose factors `to` are, in `right`.
+fn apply_relu(
+    weights: &Weights,
+    x: &Right,
+    bias: &[f32],
+    to: &mut Factors,
+    purpose: Purpose,
+    right: &mut Right,
+    product: &mut [f32],
+) {
+    let rows = to.rows();
+    for outputs in weights.output_chunks(rows) {
+        let values = &mut product[..outputs.len() * rows];
+        weights.apply(outputs.clone(), x.words(), rows, false, values);
+        let mut chunk = BiasRelu { first: outputs.start, values, bias, rows };
+        to.pack_input(outputs, &mut chunk, purpose, right);
+    }
+}
+
+/// `Wᵀ·from` where a ReLU let through, laid out as it is made for the layer whose factors `to` are, in `right`; `sums` are
+/// asked for by a pass that learns.
+fn turn_back_relu(
+    weights: &Weights,
+    from: &Right,
+    passed: Passed<'_>,
+    to: &mut Factors,
+    mut sums: Option<&mut [f32]>,
+    right: &mut Right,
+    product: &mut [f32],
+) {
+    let (rows, learns) = (to.rows(), sums.is_some());
+    for inputs in weights.input_chunks(rows) {
+        let values = &mut product[..inputs.len() * rows];
+        weights.apply_transposed(inputs.clone(), from.words(), rows, false, values);
+        let mut chunk = Gradient { first: inputs.start, values, passed, rows, sums: sums.as_deref_mut() };
+        to.pack_gradient(inputs, &mut chunk, learns, right);
     }
 }
 
@@ -309,128 +399,37 @@ pub(super) struct Ways {
 }
 
 impl Network {
-    /// The products of passes over a trace and nothing else, on whatever lies there: what an update cannot do without.
-    pub(super) fn multiply(&self, weights: &[Weights], trace: &mut Trace, ways: Ways, gradient: &mut [f32]) {
-        let Trace { layers, head_gradients, head_weights, front, back, .. } = trace;
-        let mut weights = weights.iter();
-        let mut pass = |linear: &Linear, x: &Operand, y: &Operand, first: Option<usize>| {
-            let weights = weights.next().expect("one for every linear layer");
-            (0..ways.forward).for_each(|_| weights.apply(x.right(), x.rows, false, back));
-            (0..ways.weights).for_each(|_| weight_gradient(y, x, &mut gradient[linear.weight()]));
-            let Some(first) = first else { return };
-            (0..ways.inputs).for_each(|_| weights.apply_transposed(y, first, false, front));
-        };
-        for (index, (layer, saved)) in self.layers.iter().zip(&*layers).enumerate() {
-            match layer {
-                Layer::Dense { linear, .. } => {
-                    let first = if index == 0 { ways.first } else { Some(0) };
-                    pass(linear, &saved.input, &saved.result_gradient, first);
-                }
-                Layer::Block { up, down, .. } => {
-                    pass(up, &saved.input, &saved.wide_gradient, Some(0));
-                    pass(down, &saved.activated, &saved.result_gradient, Some(0));
-                }
-                Layer::Norm(_) => {}
-            }
+    /// The products of passes over a trace, each at its whole shape, and nothing else, on whatever lies there.
+    pub(super) fn multiply(
+        &self,
+        weights: &[Weights],
+        trace: &mut Trace,
+        scratch: &mut Scratch,
+        ways: Ways,
+        gradient: &mut [f32],
+    ) {
+        let Trace { layers, factors, heads, output_gradients, rows, .. } = trace;
+        let Scratch { here, front, back, .. } = scratch;
+        let (x, rows) = (here.words(), *rows);
+        for (index, ((linear, weights), factors)) in self.linears().zip(weights).zip(factors).enumerate() {
+            let all = || 0..linear.outputs;
+            (0..ways.forward).for_each(|_| weights.apply(all(), x, rows, false, back));
+            let gradient = &mut gradient[linear.weight()];
+            (0..ways.weights).for_each(|_| factors.multiply(all(), false, gradient));
+            let Some(first) = (if index == 0 { ways.first } else { Some(0) }) else { continue };
+            let inputs = || first..linear.inputs;
+            (0..ways.inputs).for_each(|_| weights.apply_transposed(inputs(), x, rows, false, front));
         }
-        let x = features(layers);
-        for (y, weights) in head_gradients.iter().zip(weights) {
-            (0..ways.forward).for_each(|_| weights.apply(bytemuck::cast_slice(x), y.rows, false, back));
-            let turned = &mut head_weights[..x.len() / y.rows * y.features];
-            (0..ways.weights).for_each(|_| weight_gradient_transposed(y, x, turned));
-            (0..ways.inputs).for_each(|_| weights.apply_transposed(y, 0, false, front));
-        }
-    }
-}
-
-/// What the heads read, `[width, R]`.
-fn features(layers: &[Saved]) -> &[f32] {
-    &layers.last().expect("a body has a layer").result
-}
-
-/// What a pass through one layer leaves for the way back; buffers a layer does not need are empty.
-struct Saved {
-    rows: usize,
-    /// What the first product reads.
-    input: Operand,
-    /// A block's inner activations, before bias and ReLU, and as the second product reads them.
-    wide: Buffer<f32>,
-    activated: Operand,
-    norm: SavedNorm,
-    /// Of a layer whose ReLU's result another layer reads: before bias and ReLU.
-    result: Buffer<f32>,
-    /// Gradients as the products read them.
-    result_gradient: Operand,
-    wide_gradient: Operand,
-}
-
-/// What a norm leaves: the input's mean, the inverse of its standard deviation, `[R]` each, and what it makes of it.
-struct SavedNorm {
-    mean: Buffer<f32>,
-    inverse: Buffer<f32>,
-    normal: Buffer<f32>,
-}
-
-impl Saved {
-    fn new(layer: &Layer, rows: usize, memory: &mut Memory) -> Self {
-        let (inputs, width, wide, norm, format) = match layer {
-            Layer::Dense { linear, .. } => (linear.inputs, linear.outputs, 0, 0, linear.format),
-            Layer::Block { norm, up, .. } => (norm.width, norm.width, up.outputs, norm.width, up.format),
-            Layer::Norm(norm) => (0, norm.width, 0, norm.width, Format::F32),
-        };
-        let packed = if matches!(layer, Layer::Norm(_)) { 0 } else { width };
-        Self {
-            rows,
-            input: Operand::new(format, inputs, rows, memory),
-            wide: memory.zeros(wide * rows),
-            activated: Operand::new(format, wide, rows, memory),
-            norm: SavedNorm {
-                mean: memory.zeros(if norm > 0 { rows } else { 0 }),
-                inverse: memory.zeros(if norm > 0 { rows } else { 0 }),
-                normal: memory.zeros(norm * rows),
-            },
-            result: memory.zeros(width * rows),
-            result_gradient: Operand::new(format, packed, rows, memory),
-            wide_gradient: Operand::new(format, wide, rows, memory),
-        }
-    }
-}
-
-/// One pass over R transitions, R a multiple of [`kernels::LANES`].
-pub(super) struct Trace {
-    layers: Vec<Saved>,
-    rows: usize,
-    /// The heads' results, `[outputs, R]` each.
-    pub(super) outputs: Vec<Buffer<f32>>,
-    /// Where the gradients of the loss by the heads' results go before the way back.
-    pub(super) output_gradients: Vec<Buffer<f32>>,
-    head_gradients: Vec<Operand>,
-    /// The gradient of a head's weights, transposed.
-    head_weights: Buffer<f32>,
-    /// The gradient on its way back: of a layer's result, and of its input.
-    front: Buffer<f32>,
-    back: Buffer<f32>,
-    wide: Buffer<f32>,
-}
-
-impl Trace {
-    pub(super) fn new(network: &Network, rows: usize, memory: &mut Memory) -> Self {
-        let layers: Vec<Saved> = network.layers.iter().map(|layer| Saved::new(layer, rows, memory)).collect();
-        let results = layers.iter().map(|saved| saved.result.len()).max().unwrap_or(0);
-        let wide = layers.iter().map(|saved| saved.wide.len()).max().unwrap_or(0);
-        let widest = results.max(network.width * rows).max(network.inputs * rows).max(wide);
-        let head_weights = network.heads.iter().map(|head| head.inputs * head.outputs).max().unwrap_or(0);
-        let heads = || network.heads.iter().map(|head| head.outputs);
-        Self {
-            rows,
-            outputs: heads().map(|outputs| memory.zeros(outputs * rows)).collect(),
-            output_gradients: heads().map(|outputs| memory.zeros(outputs * rows)).collect(),
-            head_gradients: heads().map(|outputs| Operand::new(Format::F32, outputs, rows, memory)).collect(),
-            head_weights: memory.zeros(head_weights),
-            front: memory.zeros(widest),
-            back: memory.zeros(widest),
-            wide: memory.zeros(wide),
-            layers,
+        let features = features(layers);
+        let weights = &weights[weights.len() - self.heads.len()..];
+        for (((head, weights), output), factors) in
+            self.heads.iter().zip(weights).zip(output_gradients).zip(heads)
+        {
+            let (x, y) = (bytemuck::cast_slice(features), bytemuck::cast_slice(output));
+            (0..ways.forward).for_each(|_| weights.apply(0..head.outputs, x, rows, false, back));
+            let gradient = &mut gradient[head.weight()];
+            (0..ways.weights).for_each(|_| factors.multiply(features, false, gradient));
+            (0..ways.inputs).for_each(|_| weights.apply_transposed(0..head.inputs, y, rows, false, front));
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Matrix products of the update, by oneDNN's kernels in libtorch.
 //!
 //! A product reads its operands in *words* of 32 bits: one float32, or two bfloat16 that are neighbours along the summed
-//! side. [`super::operand`] lays them out.
+//! side. [`super::factors`] and [`super::weights`] lay them out.
 
 /// What the numbers of a product's operands are; its result is float32.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -29,6 +29,15 @@ impl Format {
             Self::Bf16 => [512; 3],
         }
     }
+
+    /// Rows that a product with a right factor `[k, n]` had better make at a time for what reads them next: few, which stay
+    /// in the fastest cache, where the right factor stays in the second one from rows to rows.
+    pub(super) fn at_a_time(self, k: usize, n: usize) -> usize {
+        if k * n / self.per_word() <= (512 << 10) / size_of::<u32>() { 64 } else { Self::MOST_AT_A_TIME }
+    }
+
+    /// The most that [`Format::at_a_time`] gives.
+    pub(super) const MOST_AT_A_TIME: usize = 256;
 
     /// `length` rounded up to whole words.
     pub(super) fn padded(self, length: usize) -> usize {
