@@ -275,7 +275,12 @@ impl Sac {
         self.lay_out();
         match std::mem::replace(&mut self.cpu, OnCpu::Absent) {
             OnCpu::Ready(mut cpu) => {
-                let losses = self.update_on_cpu(&mut cpu, batch, next_noise, noise);
+                let pool = cpu.pool();
+                let mut update = || self.update_on_cpu(&mut cpu, batch, next_noise, noise);
+                let losses = match pool {
+                    Some(pool) => pool.install(update),
+                    None => update(),
+                };
                 self.cpu = OnCpu::Ready(cpu);
                 losses
             }

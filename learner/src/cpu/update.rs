@@ -1,6 +1,6 @@
 //! One update of SAC on minibatches divided over threads.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use getup_policy::{Body, ObservationStatistics, PolicyShape};
 use rayon::ThreadPool;
@@ -19,7 +19,7 @@ use crate::sac::Batch;
 /// Networks laid out for products, and the memory of an update.
 pub(crate) struct CpuUpdate {
     /// None for one thread, which is the caller's.
-    pool: Option<ThreadPool>,
+    pool: Option<Arc<ThreadPool>>,
     threads: usize,
     actor: Network,
     critic: Network,
@@ -97,7 +97,7 @@ impl CpuUpdate {
             rooms,
             gradient_norms: [0.0; 2],
             threads: if matches!(pool, Some(Some(_))) { threads } else { 1 },
-            pool: pool.flatten(),
+            pool: pool.flatten().map(Arc::new),
             actor_weights,
             critic_weights: lay_out(values.critics, true),
             target_weights: lay_out(values.targets, false),
@@ -106,6 +106,12 @@ impl CpuUpdate {
             workers: Vec::new(),
             batch: 0,
         })
+    }
+
+    /// The threads, where there are several. What calls the update's phases from one of them spares the others' being put to
+    /// sleep and woken for each.
+    pub(crate) fn pool(&self) -> Option<Arc<ThreadPool>> {
+        self.pool.clone()
     }
 
     /// Critics' losses and gradients: y = r + γ (min Q'(s', a') − α log π(a'|s')), mean w (Q(s, a) − y)².
@@ -220,7 +226,7 @@ impl CpuUpdate {
 }
 
 /// Runs `work` on every item, on the pool where there is one.
-fn run<T: Send>(pool: &Option<ThreadPool>, items: &mut [T], work: impl Fn(&mut T) + Send + Sync) {
+fn run<T: Send>(pool: &Option<Arc<ThreadPool>>, items: &mut [T], work: impl Fn(&mut T) + Send + Sync) {
     match pool {
         Some(pool) => pool.install(|| items.par_iter_mut().with_max_len(1).for_each(&work)),
         None => items.iter_mut().for_each(work),
@@ -229,7 +235,7 @@ fn run<T: Send>(pool: &Option<ThreadPool>, items: &mut [T], work: impl Fn(&mut T
 
 /// A step of every piece; the Euclidean norm of their gradient.
 fn take_steps(
-    pool: &Option<ThreadPool>,
+    pool: &Option<Arc<ThreadPool>>,
     rooms: &[Mutex<Room>],
     pieces: &mut [Piece<'_>],
     step: AdamStep,
