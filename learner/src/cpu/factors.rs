@@ -186,12 +186,12 @@ impl HeadFactors {
         layout::transpose(words, self.outputs, rows, &mut self.columns, self.outputs);
     }
 
-    /// The weights' gradient, turned: `to = X·dYᵀ` or `to += X·dYᵀ`, `[inputs, outputs]`.
-    pub(super) fn multiply(&self, x: &[f32], accumulate: bool, to: &mut [f32]) {
+    /// The weights' gradient, turned, for some outputs: `to = X·dYᵀ` or `to += X·dYᵀ`, `[inputs, outputs]`.
+    pub(super) fn multiply(&self, x: &[f32], outputs: Range<usize>, accumulate: bool, to: &mut [f32]) {
         let rows = self.columns.len() / self.outputs;
-        let (m, n) = (x.len() / rows, self.outputs);
+        let (m, n) = (x.len() / rows, outputs.len());
         let size = Size { m, n, k: rows };
-        let product = Product { format: Format::F32, size, lda: rows, ldb: n, ldc: n, accumulate };
-        product.run(bytemuck::cast_slice(x), &self.columns, to);
+        let product = Product { format: Format::F32, size, lda: rows, ldb: self.outputs, ldc: n, accumulate };
+        product.run(bytemuck::cast_slice(x), &self.columns[outputs.start..], to);
     }
 }

@@ -428,7 +428,7 @@ impl Network {
             let (x, y) = (bytemuck::cast_slice(features), bytemuck::cast_slice(output));
             (0..ways.forward).for_each(|_| weights.apply(0..head.outputs, x, rows, false, back));
             let gradient = &mut gradient[head.weight()];
-            (0..ways.weights).for_each(|_| factors.multiply(features, false, gradient));
+            (0..ways.weights).for_each(|_| factors.multiply(features, 0..head.outputs, false, gradient));
             (0..ways.inputs).for_each(|_| weights.apply_transposed(0..head.inputs, y, rows, false, front));
         }
     }

@@ -98,7 +98,7 @@ impl Rows for BiasRelu<'_> {
         let values = &self.values[(row - self.first) * self.rows + at..][..to.len()];
         for (to, value) in to.iter_mut().zip(values) {
             let sum = *value + bias;
-            // As above: NaN stays NaN.
+            // NaN stays NaN, as it must to be noticed: `max` would drop it.
             *to = if sum < 0.0 { 0.0 } else { sum };
         }
         to

@@ -105,7 +105,7 @@ impl Trace {
                 Some(factors) => factors.multiply(outputs.clone(), index > 0, to),
                 None => {
                     let head = &trace.heads[linear - trace.factors.len()];
-                    head.multiply(features(&trace.layers), index > 0, turned);
+                    head.multiply(features(&trace.layers), outputs.clone(), index > 0, turned);
                 }
             }
         }
