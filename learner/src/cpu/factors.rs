@@ -70,8 +70,9 @@ impl Factors {
     ) -> Self {
         let words = |features: usize| format.padded(features) * rows / format.per_word();
         let signs = if after_relu { inputs.div_ceil(2) * rows / LANES } else { 0 };
+        let columns = Self::column_stride(inputs) * rows / format.per_word();
         let [plain, columns, signs] =
-            [words(outputs), words(inputs), signs].map(|length| memory.zeros(length));
+            [words(outputs), columns, signs].map(|length| memory.zeros(length));
         Self { format, inputs, rows, plain, columns, signs }
     }
 
@@ -95,7 +96,7 @@ impl Factors {
             if learns {
                 let words = self.rows / self.format.per_word();
                 let to = &mut self.columns[features.start..];
-                layout::transpose(kept, features.len(), words, to, self.inputs);
+                layout::transpose(kept, features.len(), words, to, Self::column_stride(self.inputs));
             }
         }
     }
@@ -114,6 +115,11 @@ impl Factors {
         pack(self.format, rows, self.rows, features, &mut right.words, kept, &mut []);
     }
 
+    /// Words from one row of columns to the next: not a power of two, or all rows would compete for a few places in the cache.
+    fn column_stride(inputs: usize) -> usize {
+        inputs.next_multiple_of(LANES) + LANES
+    }
+
     /// R.
     pub(super) fn rows(&self) -> usize {
         self.rows
@@ -128,7 +134,8 @@ impl Factors {
     pub(super) fn multiply(&self, outputs: Range<usize>, accumulate: bool, to: &mut [f32]) {
         let Self { format, inputs, rows, .. } = *self;
         let size = Size { m: outputs.len(), n: inputs, k: rows };
-        let product = Product { format, size, lda: rows, ldb: inputs, ldc: inputs, accumulate };
+        let ldb = Self::column_stride(inputs);
+        let product = Product { format, size, lda: rows, ldb, ldc: inputs, accumulate };
         product.run(&self.plain[outputs.start * rows / format.per_word()..], &self.columns, to);
     }
 
