@@ -71,8 +71,7 @@ impl Factors {
         let words = |features: usize| format.padded(features) * rows / format.per_word();
         let signs = if after_relu { inputs.div_ceil(2) * rows / LANES } else { 0 };
         let columns = Self::column_stride(inputs) * rows / format.per_word();
-        let [plain, columns, signs] =
-            [words(outputs), columns, signs].map(|length| memory.zeros(length));
+        let [plain, columns, signs] = [words(outputs), columns, signs].map(|length| memory.zeros(length));
         Self { format, inputs, rows, plain, columns, signs }
     }
 

@@ -126,7 +126,7 @@ unsafe fn adam_lanes(
     }
 }
 
-/// Rows of weights, `[outputs, inputs]`, as a step of AdamW makes them.
+/// Rows of weights, `[outputs, inputs]`, as a step of AdamW makes them: asking for a number takes its step.
 pub(super) struct AdamRows<'a> {
     pub(super) step: AdamStep,
     pub(super) inputs: usize,
@@ -161,7 +161,7 @@ impl Rows for AdamRows<'_> {
     }
 }
 
-/// Rows of a target network's weights, `[outputs, inputs]`, as Polyak averaging makes them.
+/// Rows of a target network's weights, `[outputs, inputs]`, as Polyak averaging makes them, likewise.
 pub(super) struct PolyakRows<'a> {
     pub(super) tau: f32,
     pub(super) inputs: usize,
