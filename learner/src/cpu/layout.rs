@@ -254,7 +254,7 @@ pub(super) fn write<R: Rows>(
     }
 }
 
-/// [`write`] by the processor's own instructions, as far as whole lanes go.
+/// [`write()`] by the processor's own instructions, as far as whole lanes go.
 ///
 /// # Safety
 /// The processor has AVX-512 F.
@@ -292,7 +292,7 @@ unsafe fn write_lanes<R: Rows>(
     }
 }
 
-/// [`write`] part after part, from number `from` of every row on.
+/// [`write()`] part after part, from number `from` of every row on.
 #[multiversion(targets("x86_64+avx2+fma"))]
 pub(super) fn write_parts<R: Rows>(
     rows: &mut R,
