@@ -74,7 +74,7 @@ impl LearnerMetrics {
             ),
             wait_seconds: seconds("wait_seconds", "Time waited for a minibatch."),
             phases: {
-                let help = "Time of updates, by phase: batch, critics, actor, optimizer.";
+                let help = "Time of updates, by phase: batch, critics, actor, optimizer (on a processor with the gradients of weights).";
                 let name = "getup_learner_update_phase_seconds_total";
                 register_counter_vec_with_registry!(name, help, &["phase"], registry).expect(PROVEN)
             },

@@ -86,16 +86,16 @@ pub struct Phases {
     pub critics: f64,
     /// The actor's loss and gradient.
     pub actor: f64,
-    /// Steps of AdamW and of Polyak averaging.
+    /// Steps of AdamW and of Polyak averaging; on a processor the weights' gradients, too, which a step makes as it goes.
     pub optimizer: f64,
 }
 
 /// Euclidean norms of what an update works with.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Norms {
-    /// Of the actor's weights, and of its gradient at the last update.
+    /// Of the actor's weights, and of its gradient at its last step.
     pub actor: [f64; 2],
-    /// Of all critics' weights, and of their gradient at the last update.
+    /// Of all critics' weights, and of their gradient at their last step.
     pub critics: [f64; 2],
 }
 

@@ -240,6 +240,7 @@ pub(super) fn write<R: Rows>(
     signs: &mut [u32],
 ) {
     let numbers = range.len() * length;
+    assert!(range.start.is_multiple_of(2), "rows {range:?} begin in the middle of two");
     assert!(to.len() >= numbers, "{range:?} × {length} numbers into {}", to.len());
     assert!(signs.is_empty() || signs.len() * LANES >= range.len().div_ceil(2) * length);
     let mut done = 0;

@@ -29,7 +29,7 @@ pub(super) struct Gradients<'a> {
 }
 
 /// The first `length` numbers of `rest`, which keeps the others.
-pub(super) fn take<'a>(rest: &mut &'a mut [f32], length: usize) -> &'a mut [f32] {
+fn take<'a>(rest: &mut &'a mut [f32], length: usize) -> &'a mut [f32] {
     let (taken, kept) = std::mem::take(rest).split_at_mut(length);
     *rest = kept;
     taken
@@ -70,6 +70,7 @@ pub(super) fn cut<'a>(
     let mut weights = weights.iter_mut().enumerate();
     let (mut targets, target_weights) = target.unzip();
     let mut target_weights = target_weights.map(|weights| weights.iter_mut());
+    let body_linears = network.body_linears();
     let mut add = |range: Range<usize>, linear| {
         let length = range.len();
         let flat = Flat {
@@ -86,7 +87,7 @@ pub(super) fn cut<'a>(
             continue;
         }
         let (index, weights) = weights.next().expect("one for every linear layer");
-        let is_head = index >= network.body_linears();
+        let is_head = index >= body_linears;
         let mut targets =
             target_weights.as_mut().and_then(Iterator::next).map(|weights| weights.parts.iter_mut());
         let mut parts = weights.parts.iter_mut().peekable();
@@ -113,7 +114,7 @@ impl Room {
     pub(super) fn new(networks: [&Network; 2], memory: &mut Memory) -> Self {
         let longest = networks.into_iter().map(Network::longest_gradient).max().unwrap_or(0);
         let heads = networks.into_iter().flat_map(Network::head_weights).max().unwrap_or(0);
-        Self { gradient: memory.zeros(longest.max(heads)), turned: memory.zeros(heads) }
+        Self { gradient: memory.zeros(longest), turned: memory.zeros(heads) }
     }
 }
 

@@ -50,7 +50,7 @@ pub(super) struct Worker {
     pub(super) actor: Trace,
     pub(super) critics: Vec<Trace>,
     pub(super) scratch: Scratch,
-    /// Of biases and norms, where they lie among the parameters; the rest is never touched.
+    /// Of biases and norms, where they lie among the parameters; the rest serves only [`super::update::CpuUpdate::multiply`].
     pub(super) actor_gradient: Buffer<f32>,
     pub(super) critics_gradient: Buffer<f32>,
     /// |Q − y| of each transition, mean over the critics.
