@@ -360,8 +360,8 @@ mod tests {
         // What the recipes add is off.
         assert_eq!((sac.network, sac.precision), (NetworkKind::Mlp, Precision::Fp32));
         assert_eq!(
-            (sac.weight_decay, sac.temperature_floor, sac.lr_steps, sac.critics_first),
-            (0.0, 0.0, 0, 0)
+            (sac.weight_decay, sac.temperature_floor, sac.lr_steps, sac.critics_first, sac.policy_delay),
+            (0.0, 0.0, 0, 0, 1)
         );
         assert_eq!((config.actor.fall_pool, config.actor.noise_hold), (0, 1));
         assert_eq!((curriculum.high_starts, curriculum.fixed, config.task.fall_ends), (0.0, false, false));

@@ -68,14 +68,21 @@ impl Batch {
 pub struct Losses {
     /// Mean squared error of the critics, by the transitions' weights, summed over them.
     pub critic: f64,
-    /// Mean of α·log π − Q.
+    /// Mean of α·log π − Q, of the last update that the actor learned by.
     pub actor: f64,
     /// α after the update.
     pub temperature: f64,
-    /// Mean of −log π, in nats.
+    /// Mean of −log π, in nats, of the same update.
     pub entropy: f64,
     /// Mean Q of the batch's own actions.
     pub q: f64,
+}
+
+/// What an update of the actor found; see [`Losses`].
+#[derive(Clone, Copy, Debug, Default)]
+struct PolicyLoss {
+    actor: f64,
+    entropy: f64,
 }
 
 /// Where the time of updates went, in seconds since this process began. On a GPU, whose work is waited for at each loss, it
@@ -151,10 +158,12 @@ pub struct Sac {
     pub(crate) began_trained: bool,
     /// See [`Sac::td_errors`].
     td_errors: Vec<f32>,
+    /// Of the actor's last update.
+    policy: PolicyLoss,
     /// See [`Sac::phases`].
     phases: Phases,
     /// `[n]` each, of the last update by autograd: of the critics, of the actor.
-    gradients: Option<[Tensor; 2]>,
+    gradients: [Option<Tensor>; 2],
     /// The update for processors, laid out at the first one; see [`Sac::changed`].
     cpu: OnCpu,
 }
@@ -196,8 +205,9 @@ impl Sac {
             updates: 0,
             began_trained: false,
             td_errors: Vec::new(),
+            policy: PolicyLoss::default(),
             phases: Phases::default(),
-            gradients: None,
+            gradients: [None, None],
             cpu: OnCpu::Unknown,
         }
     }
@@ -246,10 +256,9 @@ impl Sac {
     /// Norms of weights and gradients as they are now.
     pub fn norms(&self) -> Norms {
         let norm = |tensor: &Tensor| tensor.norm().double_value(&[]);
-        let [critics, actor] = match (&self.cpu, &self.gradients) {
-            (OnCpu::Ready(cpu), _) => cpu.gradient_norms(),
-            (_, Some(gradients)) => gradients.each_ref().map(norm),
-            (_, None) => [0.0; 2],
+        let [critics, actor] = match &self.cpu {
+            OnCpu::Ready(cpu) => cpu.gradient_norms(),
+            _ => self.gradients.each_ref().map(|gradient| gradient.as_ref().map_or(0.0, norm)),
         };
         Norms {
             actor: [norm(self.actor.parameters.flat()), actor],
@@ -259,13 +268,14 @@ impl Sac {
 
     /// One update of critics, actor, temperature and targets.
     pub fn update(&mut self, batch: &Batch) -> Result<Losses, NonFiniteLoss> {
-        let count = batch.action.len();
-        let mut noise = || (0..count).map(|_| self.rng.sample(StandardNormal)).collect::<Vec<f32>>();
-        let (next_noise, noise) = (noise(), noise());
+        let (count, learns) = (batch.action.len(), self.actor_learns());
+        let mut draw = |count| (0..count).map(|_| self.rng.sample(StandardNormal)).collect::<Vec<f32>>();
+        let (next_noise, noise) = (draw(count), draw(if learns { count } else { 0 }));
         self.update_with_noise(batch, &next_noise, &noise)
     }
 
-    /// [`Sac::update`] with the standard normal draws of the next actions and of the actions, `[B, action]` each.
+    /// [`Sac::update`] with the standard normal draws of the next actions and of the actions, `[B, action]` each; the latter
+    /// are looked at where the actor learns.
     pub(crate) fn update_with_noise(
         &mut self,
         batch: &Batch,
@@ -301,7 +311,7 @@ impl Sac {
         let column = |values: &[f32]| Tensor::from_slice(values).to_device(self.device);
         let (action, beta) = (matrix(&batch.action), matrix(&batch.beta));
         let (reward, discount) = (column(&batch.reward), column(&batch.discount));
-        let (next_noise, noise) = (matrix(next_noise), matrix(noise));
+        let next_noise = matrix(next_noise);
         let observation = self.normalize(&matrix(&batch.observation));
         let next_observation = self.normalize(&matrix(&batch.next_observation));
         let temperature = self.log_temperature.exp();
@@ -327,23 +337,25 @@ impl Sac {
         self.critics_adam.step(&mut self.critics.parameters, &critics_gradient);
         lap.add_to(&mut self.phases.optimizer);
 
-        // mean (α log π(a|s) − min Q(s, a)), a ~ π(s)
-        let sample = self.actor.forward(&observation).sample(&beta, &noise);
-        let value = self.critics.minimum(&observation, &sample.action);
-        let actor_loss = (&sample.log_prob * temperature - value).mean(Kind::Float);
-        let actor = self.finite("actor", actor_loss.double_value(&[]))?;
-        let actor_gradient = self.actor.parameters.gradient(&actor_loss);
-        lap.add_to(&mut self.phases.actor);
-        if self.actor_learns() {
-            self.actor_adam.step(&mut self.actor.parameters, &actor_gradient);
-        }
-        self.gradients = Some([critics_gradient, actor_gradient]);
+        self.gradients[0] = Some(critics_gradient);
 
-        let entropy = -sample.log_prob.mean(Kind::Float).double_value(&[]);
+        if self.actor_learns() {
+            // mean (α log π(a|s) − min Q(s, a)), a ~ π(s)
+            let sample = self.actor.forward(&observation).sample(&beta, &matrix(noise));
+            let value = self.critics.minimum(&observation, &sample.action);
+            let loss = (&sample.log_prob * temperature - value).mean(Kind::Float);
+            let actor = self.finite("actor", loss.double_value(&[]))?;
+            let gradient = self.actor.parameters.gradient(&loss);
+            lap.add_to(&mut self.phases.actor);
+            self.actor_adam.step(&mut self.actor.parameters, &gradient);
+            self.gradients[1] = Some(gradient);
+            self.actor_learned(actor, -sample.log_prob.mean(Kind::Float).double_value(&[]));
+        }
+
         polyak(&mut self.targets.parameters, &self.critics.parameters, self.config.tau);
         let q = q.mean(Kind::Float).double_value(&[]);
         lap.add_to(&mut self.phases.optimizer);
-        Ok(self.end_update(critic, actor, entropy, q))
+        Ok(self.end_update(critic, q))
     }
 
     /// The same, written out: see [`crate::cpu`].
@@ -373,34 +385,41 @@ impl Sac {
         cpu.critics_step(Flat { values: critics, first, second }, targets, step, self.config.tau as f32);
 
         lap.add_to(&mut self.phases.optimizer);
-        let policy = cpu.actor_backward(&inputs, Values { actor, critics, targets });
-        let actor_loss = self.finite("actor", policy.loss)?;
-        lap.add_to(&mut self.phases.actor);
         if self.actor_learns() {
+            let policy = cpu.actor_backward(&inputs, Values { actor, critics, targets });
+            let loss = self.finite("actor", policy.loss)?;
+            lap.add_to(&mut self.phases.actor);
             let step = self.actor_adam.begin_step();
             let (first, second) = self.actor_adam.moments();
             cpu.actor_step(Flat { values: actor, first, second }, step);
+            self.actor_learned(loss, policy.value);
+            lap.add_to(&mut self.phases.optimizer);
         }
-        lap.add_to(&mut self.phases.optimizer);
-        Ok(self.end_update(critic_loss, actor_loss, policy.value, critic.value))
+        Ok(self.end_update(critic_loss, critic.value))
     }
 
-    /// Whether the critics have had their updates alone.
+    /// Whether the actor learns by the next update: the critics have had theirs alone, and it is the actor's turn.
     fn actor_learns(&self) -> bool {
-        self.updates >= self.config.critics_first
+        let SacConfig { critics_first, policy_delay, .. } = self.config;
+        self.updates >= critics_first && self.updates.is_multiple_of(policy_delay)
     }
 
-    /// The temperature's step, along the gradient of mean α (−log π − H̄) by log α; and the count.
-    fn end_update(&mut self, critic: f64, actor: f64, entropy: f64, q: f64) -> Losses {
-        let gradient = self.log_temperature.exp() * (entropy - self.target_entropy);
-        let floor = self.config.temperature_floor.ln();
+    /// What follows a step of the actor: its average, and the temperature's step along the gradient of mean α (−log π − H̄)
+    /// by log α.
+    fn actor_learned(&mut self, loss: f64, entropy: f64) {
+        self.policy = PolicyLoss { actor: loss, entropy };
         if let Some(average) = &mut self.average {
             let _ = tch::no_grad(|| average.lerp_(self.actor.parameters.flat(), self.config.actor_average));
         }
-        if self.actor_learns() {
-            self.log_temperature = self.temperature_adam.step(self.log_temperature, gradient).max(floor);
-        }
+        let gradient = self.log_temperature.exp() * (entropy - self.target_entropy);
+        let floor = self.config.temperature_floor.ln();
+        self.log_temperature = self.temperature_adam.step(self.log_temperature, gradient).max(floor);
+    }
+
+    /// Counts an update.
+    fn end_update(&mut self, critic: f64, q: f64) -> Losses {
         self.updates += 1;
+        let PolicyLoss { actor, entropy } = self.policy;
         Losses { critic, actor, temperature: self.log_temperature.exp(), entropy, q }
     }
 

@@ -59,6 +59,8 @@ pub struct SacConfig {
     /// Transitions that the replay holds before the updates of a trained actor go on: where a run begins with another's
     /// (`--from`), resumes without its replay, or loses it. No more than the run has made, and at most half of `replay.capacity`.
     pub refill_steps: u64,
+    /// The actor and the temperature learn by every so many updates, the critics by each (TD3: Fujimoto et al. 2018).
+    pub policy_delay: u64,
     /// Updates at the start that leave the actor as it is: for one that begins trained, with critics that do not.
     pub critics_first: u64,
     /// Share of the new weights in an average of the actor's at every update; 0 for none. With it, the average is what is
@@ -178,6 +180,7 @@ impl Default for SacConfig {
             updates_per_step: 1.0,
             uniform_steps: 10_000,
             refill_steps: 150_000,
+            policy_delay: 1,
             critics_first: 0,
             actor_average: 0.0,
             precision: Precision::Fp32,
@@ -215,6 +218,7 @@ impl SacConfig {
         ] {
             check((0.0..=1.0).contains(&rate), key, &rate, "from 0 to 1")?;
         }
+        check((1..=64).contains(&self.policy_delay), "sac.policy_delay", &self.policy_delay, "from 1 to 64")?;
         let alpha = self.initial_temperature;
         check(alpha > 0.0 && alpha.is_finite(), "sac.initial_temperature", &alpha, "over 0")?;
         let floor = self.temperature_floor;

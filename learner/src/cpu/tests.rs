@@ -268,6 +268,35 @@ fn an_actor_whose_critics_come_first_stays_as_it_is_until_they_had_their_updates
     }
 }
 
+#[test]
+fn a_delayed_policy_learns_by_its_updates_only_and_the_critics_by_all() {
+    for autograd in [false, true] {
+        let config = SacConfig { policy_delay: 2, actor_average: 0.5, ..configurations().remove(0) };
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let mut sac = Sac::new(&SHAPE, &config, 1, Device::Cpu, 1);
+        let actor = |sac: &Sac| {
+            let average = to_vec(sac.average.as_ref().unwrap());
+            (to_vec(sac.actor.parameters.flat()), average, sac.log_temperature)
+        };
+        let mut losses = Losses::default();
+        for update in 0..5 {
+            let (before, critics) = (actor(&sac), to_vec(sac.critics.parameters.flat()));
+            let batch = batch(16, &mut rng);
+            let noise = random(16 * SHAPE.action, -2.0, 2.0, &mut rng);
+            let last = losses;
+            losses = match autograd {
+                true => sac.update_by_autograd(&batch, &noise, &noise).unwrap(),
+                false => sac.update_with_noise(&batch, &noise, &noise).unwrap(),
+            };
+            let learns = update % 2 == 0;
+            assert_eq!(actor(&sac) != before, learns, "update {update}");
+            // What was found of the actor stays that of its last update.
+            assert_eq!((losses.actor, losses.entropy) != (last.actor, last.entropy), learns, "update {update}");
+            assert_ne!(to_vec(sac.critics.parameters.flat()), critics, "update {update}");
+        }
+    }
+}
+
 /// What came of laying rows out: plain, pairs and signs.
 type LaidOut = (Vec<u16>, Vec<u32>, Vec<u32>);
 
