@@ -85,9 +85,15 @@ impl LearnerMetrics {
                 "1 once training stopped because a loss was no number any more.",
             ),
             critic_loss: gauge("critic_loss", "Mean squared error of the critics, summed over them."),
-            actor_loss: gauge("actor_loss", "Mean of temperature times log-probability less Q."),
+            actor_loss: gauge(
+                "actor_loss",
+                "Mean of temperature times log-probability less Q, when the actor last learned.",
+            ),
             temperature: gauge("temperature", "SAC's temperature."),
-            entropy: gauge("entropy_nats", "Mean entropy of the policy over a minibatch, in nats."),
+            entropy: gauge(
+                "entropy_nats",
+                "Mean entropy of the policy over a minibatch, in nats, when the actor last learned.",
+            ),
             q: gauge("q", "Mean Q of a minibatch's own actions."),
             beta: gauge("beta", "Torque-limit multiplier of the stage."),
             stage: whole("stage", "Stage of the curriculum, from 0."),

@@ -291,7 +291,11 @@ fn a_delayed_policy_learns_by_its_updates_only_and_the_critics_by_all() {
             let learns = update % 2 == 0;
             assert_eq!(actor(&sac) != before, learns, "update {update}");
             // What was found of the actor stays that of its last update.
-            assert_eq!((losses.actor, losses.entropy) != (last.actor, last.entropy), learns, "update {update}");
+            assert_eq!(
+                (losses.actor, losses.entropy) != (last.actor, last.entropy),
+                learns,
+                "update {update}"
+            );
             assert_ne!(to_vec(sac.critics.parameters.flat()), critics, "update {update}");
         }
     }
