@@ -222,7 +222,7 @@ def learning_curve(runs):
         draw_omega(axes)
         label_x(axes, axis)
         axes.set_ylim(bottom=0)
-    panels[0][1].legend(loc="lower right")
+    panels[1][0].legend(loc="lower right")
     return figure
 
 
@@ -237,7 +237,7 @@ def torque_limit(runs):
             axes.plot(run.against(axis), run.column("beta"), **style)
         axes.axhline(1, color="#333333", linestyle=(0, (1, 2)), linewidth=1.1, label="the character’s own")
         label_x(axes, axis)
-    panels[0][1].legend(loc="upper right")
+    panels[1][0].legend(loc="upper right")
     return figure
 
 

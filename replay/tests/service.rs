@@ -8,7 +8,7 @@ use fixtures::{Ending, Part, segment, spec};
 use getup_proto::v1::append_request::Message;
 use getup_proto::{RunSpec, Segment, columns, v1};
 use getup_replay::{LocalSource, MinibatchSource, ReplayConfig, describe};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tonic::Code;
 
 #[test]
@@ -302,12 +302,13 @@ fn shutdown_acknowledges_what_came_tells_clients_and_takes_little_time() {
             }
         }
     });
-    let runtime = replay.runtime.handle().clone();
     std::thread::sleep(Duration::from_millis(20));
-    let stopping = std::thread::spawn(move || replay.stop());
-    let (durable, status) = runtime.block_on(reading).unwrap();
-    let (result, took) = stopping.join().unwrap();
-    result.unwrap();
+    let started = Instant::now();
+    replay.shutdown.trigger();
+    // What reads is a task of the runtime that ends with the replay, so it is waited for first.
+    let (durable, status) = replay.runtime.block_on(reading).unwrap();
+    replay.stop().0.unwrap();
+    let took = started.elapsed();
     assert!(took < Duration::from_secs(3), "{took:?}");
     assert_eq!(status.code(), Code::Unavailable, "{status}");
     assert!(durable > 0);
