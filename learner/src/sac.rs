@@ -2,8 +2,6 @@
 //!
 //! [`Sac::update`] reads top to bottom like the paper: target, critic loss, actor loss, temperature loss, Polyak.
 
-use std::time::Instant;
-
 use getup_policy::Policy;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -18,8 +16,11 @@ use crate::parameters::{as_slice_mut, to_vec};
 use crate::statistics::RunningStatistics;
 
 mod policies;
+mod reports;
 
 pub use policies::ActorMismatch;
+use reports::{Lap, PolicyLoss};
+pub use reports::{Losses, NonFiniteLoss, Norms, Phases};
 
 /// What SAC must know of the task.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -61,79 +62,6 @@ impl Batch {
     pub(crate) fn weight(&self, row: usize) -> f32 {
         self.weight.get(row).copied().unwrap_or(1.0)
     }
-}
-
-/// What one update found, for metrics.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Losses {
-    /// Mean squared error of the critics, by the transitions' weights, summed over them.
-    pub critic: f64,
-    /// Mean of α·log π − Q, of the last update that the actor learned by.
-    pub actor: f64,
-    /// α after the update.
-    pub temperature: f64,
-    /// Mean of −log π, in nats, of the same update.
-    pub entropy: f64,
-    /// Mean Q of the batch's own actions.
-    pub q: f64,
-}
-
-/// What an update of the actor found; see [`Losses`].
-#[derive(Clone, Copy, Debug, Default)]
-struct PolicyLoss {
-    actor: f64,
-    entropy: f64,
-}
-
-/// Where the time of updates went, in seconds since this process began. On a GPU, whose work is waited for at each loss, it
-/// is the time until then.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Phases {
-    /// The critics' targets, losses and gradients.
-    pub critics: f64,
-    /// The actor's loss and gradient.
-    pub actor: f64,
-    /// Steps of AdamW and of Polyak averaging; on a processor the weights' gradients, too, which a step makes as it goes.
-    pub optimizer: f64,
-}
-
-/// Euclidean norms of what an update works with.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Norms {
-    /// Of the actor's weights, and of its gradient at its last step.
-    pub actor: [f64; 2],
-    /// Of all critics' weights, and of their gradient at their last step.
-    pub critics: [f64; 2],
-}
-
-/// Adds the time since it was last asked.
-struct Lap(Instant);
-
-impl Lap {
-    fn start() -> Self {
-        Self(Instant::now())
-    }
-
-    fn add_to(&mut self, phase: &mut f64) {
-        let now = Instant::now();
-        *phase += now.duration_since(self.0).as_secs_f64();
-        self.0 = now;
-    }
-}
-
-/// A loss that is not a number any more. The networks are those of before the update that found it, or differ
-/// from them by finite steps: the last checkpoint is good.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error(
-    "the {name} loss is {value} at update {update}; lower its learning rate, or resume the last checkpoint"
-)]
-pub struct NonFiniteLoss {
-    /// Which loss.
-    pub name: &'static str,
-    /// Its value.
-    pub value: f64,
-    /// Updates before this one.
-    pub update: u64,
 }
 
 /// The learner's networks with everything that training them needs.
