@@ -3,20 +3,26 @@
 //! orders for other sizes, and is made for more rows than an actor has lanes.
 
 use multiversion::multiversion;
+use multiversion::target::selected_target;
 
 use crate::Policy;
 
 /// Outputs that are summed up together: a few vectors.
 const WIDTH: usize = 32;
-/// Rows that share a pass over the weights.
-const ROWS: usize = 4;
+/// The most rows that share a pass over the weights.
+const ROWS: usize = 8;
+
+/// What one input weighs in [`WIDTH`] outputs. A vector of it lies in one line of the cache.
+#[derive(Clone, Copy)]
+#[repr(align(64))]
+struct Weights([f32; WIDTH]);
 
 /// A layer, laid out for [`Layer::apply`].
 pub(crate) struct Layer {
     pub(crate) inputs: usize,
     pub(crate) outputs: usize,
     /// Blocks of [`WIDTH`] outputs, `[inputs, WIDTH]` each, the last one padded with zeros.
-    weight: Vec<f32>,
+    weight: Vec<Weights>,
     bias: Vec<f32>,
 }
 
@@ -25,12 +31,11 @@ impl Layer {
     pub(crate) fn new(name: &str, inputs: usize, policy: &Policy) -> Self {
         let bias = policy.tensor(&format!("{name}.bias")).to_vec();
         let outputs = bias.len();
-        let mut weight = vec![0.0; outputs.div_ceil(WIDTH) * WIDTH * inputs];
+        let mut weight = vec![Weights([0.0; WIDTH]); outputs.div_ceil(WIDTH) * inputs];
         let rows = policy.tensor(&format!("{name}.weight")).chunks_exact(inputs);
         for (output, row) in rows.enumerate() {
-            let block = &mut weight[output / WIDTH * WIDTH * inputs..][..WIDTH * inputs];
-            let column = block.iter_mut().skip(output % WIDTH).step_by(WIDTH);
-            column.zip(row).for_each(|(to, value)| *to = *value);
+            let block = weight[output / WIDTH * inputs..].iter_mut();
+            block.zip(row).for_each(|(weights, value)| weights.0[output % WIDTH] = *value);
         }
         Self { inputs, outputs, weight, bias }
     }
@@ -51,40 +56,51 @@ impl Layer {
 
 /// `to += from · Wᵀ`.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn multiply(from: &[f32], inputs: usize, weight: &[f32], outputs: usize, to: &mut [f32]) {
-    for (block, weight) in weight.chunks_exact(WIDTH * inputs).enumerate() {
+fn multiply(from: &[f32], inputs: usize, weight: &[Weights], outputs: usize, to: &mut [f32]) {
+    // Elsewhere a fused product and sum would be a call of a function.
+    const FUSED: bool = selected_target!().supports_feature_str("fma") || cfg!(target_arch = "aarch64");
+    for (block, weight) in weight.chunks_exact(inputs).enumerate() {
         let first = block * WIDTH;
-        let tiles = from.chunks(ROWS * inputs).zip(to.chunks_mut(ROWS * outputs));
-        for (from, to) in tiles {
-            match from.len() / inputs {
-                1 => tile::<1>(from, inputs, weight, outputs, first, to),
-                2 => tile::<2>(from, inputs, weight, outputs, first, to),
-                3 => tile::<3>(from, inputs, weight, outputs, first, to),
-                _ => tile::<ROWS>(from, inputs, weight, outputs, first, to),
-            }
+        let (mut from, mut to) = (from, &mut *to);
+        while !from.is_empty() {
+            let rows = match from.len() / inputs {
+                ROWS.. => tile::<ROWS, FUSED>(from, weight, outputs, first, to),
+                4.. => tile::<4, FUSED>(from, weight, outputs, first, to),
+                2.. => tile::<2, FUSED>(from, weight, outputs, first, to),
+                _ => tile::<1, FUSED>(from, weight, outputs, first, to),
+            };
+            (from, to) = (&from[rows * inputs..], &mut to[rows * outputs..]);
         }
     }
 }
 
-/// The outputs from `first` on that one block of weights gives, for `R` rows.
+/// The outputs from `first` on that one block of weights gives, for the first `R` rows; `R`.
 #[inline(always)]
-fn tile<const R: usize>(
+fn tile<const R: usize, const FUSED: bool>(
     from: &[f32],
-    inputs: usize,
-    weight: &[f32],
+    weight: &[Weights],
     outputs: usize,
     first: usize,
     to: &mut [f32],
-) {
-    let rows: [&[f32]; R] = std::array::from_fn(|row| &from[row * inputs..][..inputs]);
+) -> usize {
+    let inputs = weight.len();
+    let from = &from[..R * inputs];
     let mut sums = [[0.0f32; WIDTH]; R];
-    for (input, weight) in weight.chunks_exact(WIDTH).take(inputs).enumerate() {
-        for (sums, row) in sums.iter_mut().zip(&rows) {
-            let x = row[input];
-            (0..WIDTH).for_each(|output| sums[output] += x * weight[output]);
+    // By index: where this is unrolled, the sums stay in registers.
+    for (input, Weights(weight)) in weight.iter().enumerate() {
+        for row in 0..R {
+            // SAFETY: `row` is under `R`, `input` under `inputs`, and `from` has `R * inputs` numbers.
+            let x = unsafe { *from.get_unchecked(row * inputs + input) };
+            for output in 0..WIDTH {
+                let (weight, sum) = (weight[output], &mut sums[row][output]);
+                *sum = if FUSED { x.mul_add(weight, *sum) } else { *sum + x * weight };
+            }
         }
     }
     for (sums, row) in sums.iter().zip(to.chunks_exact_mut(outputs)) {
-        row[first..].iter_mut().zip(sums).for_each(|(to, sum)| *to += sum);
+        for (to, sum) in row[first..].iter_mut().zip(sums) {
+            *to += sum;
+        }
     }
+    R
 }

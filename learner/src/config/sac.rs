@@ -89,40 +89,30 @@ pub enum NetworkKind {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
-    /// bfloat16 where the processor multiplies it (AVX512-BF16, AMX), float32 elsewhere.
+    /// On a processor whichever it multiplies faster, found by multiplying: bfloat16 with AMX and on AMD's processors with
+    /// AVX512-BF16, float32 elsewhere. bfloat16 on a GPU.
     Auto,
     /// float32.
     Fp32,
-    /// bfloat16, which is slow where the processor does not multiply it.
+    /// bfloat16, which is slow where the processor does not multiply it faster.
     Bf16,
 }
 
+#[cfg(feature = "torch")]
 impl Precision {
     /// Whether the products are in bfloat16 on this processor.
-    pub fn is_bf16(self) -> bool {
+    pub(crate) fn is_bf16(self) -> bool {
         match self {
             Self::Fp32 => false,
             Self::Bf16 => true,
-            Self::Auto => multiplies_bf16(),
+            Self::Auto => crate::cpu::bf16_is_faster(),
         }
     }
 
-    #[cfg(feature = "torch")]
     pub(crate) fn kind(self, device: tch::Device) -> tch::Kind {
         let bf16 = if device.is_cuda() { self != Self::Fp32 } else { self.is_bf16() };
         if bf16 { tch::Kind::BFloat16 } else { tch::Kind::Float }
     }
-}
-
-#[cfg(target_arch = "x86_64")]
-fn multiplies_bf16() -> bool {
-    // Every processor with AMX-BF16 has AVX512-BF16 too.
-    is_x86_feature_detected!("avx512bf16")
-}
-
-#[cfg(not(target_arch = "x86_64"))]
-fn multiplies_bf16() -> bool {
-    false
 }
 
 /// See [`SacConfig::target_entropy`].

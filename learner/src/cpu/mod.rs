@@ -30,5 +30,6 @@ mod worker;
 mod tests;
 
 pub(crate) use optimizer::AdamStep;
+pub(crate) use product::bf16_is_faster;
 pub(crate) use step::Flat;
 pub(crate) use update::{CpuUpdate, Inputs, Values};

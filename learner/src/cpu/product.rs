@@ -3,6 +3,9 @@
 //! A product reads its operands in *words* of 32 bits: one float32, or two bfloat16 that are neighbours along the summed
 //! side. [`super::factors`] and [`super::weights`] lay them out.
 
+use std::sync::LazyLock;
+use std::time::{Duration, Instant};
+
 /// What the numbers of a product's operands are; its result is float32.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) enum Format {
@@ -55,6 +58,35 @@ impl Format {
         let product = Product { format: self, size, lda: 16, ldb: 16, ldc: 16, accumulate: false };
         product.try_run(&words, &words, &mut result) && result.iter().all(|value| *value == 16.0)
     }
+}
+
+/// Whether this processor multiplies bfloat16 faster than float32, found by multiplying, once. With AMX it does so many
+/// times, AMD's with AVX512-BF16 twice; Intel's AVX512-BF16 alone takes twice as long as its float32.
+pub(crate) fn bf16_is_faster() -> bool {
+    /// The shortest of so many turns: what else runs on the machine makes a turn longer, never shorter.
+    const TURNS: usize = 8;
+    const SIDE: usize = 256;
+    static FASTER: LazyLock<bool> = LazyLock::new(|| {
+        let formats = [Format::F32, Format::Bf16];
+        if !formats.iter().all(|format| format.works()) {
+            return false;
+        }
+        let (words, mut result) = (vec![0u32; SIDE * SIDE], vec![0.0; SIDE * SIDE]);
+        let mut shortest = [Duration::MAX; 2];
+        for _ in 0..TURNS {
+            for (format, shortest) in formats.into_iter().zip(&mut shortest) {
+                let size = Size { m: SIDE, n: SIDE, k: SIDE };
+                let product = Product { format, size, lda: SIDE, ldb: SIDE, ldc: SIDE, accumulate: false };
+                let start = Instant::now();
+                product.run(&words, &words, &mut result);
+                *shortest = start.elapsed().min(*shortest);
+            }
+        }
+        let [fp32, bf16] = shortest;
+        tracing::debug!(?fp32, ?bf16, "a product of {SIDE} × {SIDE} × {SIDE}");
+        bf16 < fp32
+    });
+    *FASTER
 }
 
 /// The sides of a product: `[m, k] · [k, n]`.
