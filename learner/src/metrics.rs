@@ -39,6 +39,7 @@ pub(crate) struct LearnerMetrics {
     pub(crate) promotions: IntCounter,
     pub(crate) checkpoints: IntCounter,
     pub(crate) checkpoint_seconds: Histogram,
+    pub(crate) filling: IntGauge,
     pub(crate) finished: IntGauge,
 }
 
@@ -55,6 +56,11 @@ impl LearnerMetrics {
         };
         let gauge = |name: &str, help: &str| {
             register_gauge_with_registry!(format!("getup_learner_{name}"), help, registry).expect(PROVEN)
+        };
+        let unknown = |name: &str, help: &str| {
+            let gauge = gauge(name, help);
+            gauge.set(f64::NAN);
+            gauge
         };
         let by_network = |name: &str, help: &str| {
             register_gauge_vec_with_registry!(format!("getup_learner_{name}"), help, &["network"], registry)
@@ -85,14 +91,14 @@ impl LearnerMetrics {
                 "1 once training stopped because a loss was no number any more.",
             ),
             critic_loss: gauge("critic_loss", "Mean squared error of the critics, summed over them."),
-            actor_loss: gauge(
+            actor_loss: unknown(
                 "actor_loss",
-                "Mean of temperature times log-probability less Q, when the actor last learned.",
+                "Mean of temperature times log-probability less Q, when the actor last learned; NaN before.",
             ),
             temperature: gauge("temperature", "SAC's temperature."),
-            entropy: gauge(
+            entropy: unknown(
                 "entropy_nats",
-                "Mean entropy of the policy over a minibatch, in nats, when the actor last learned.",
+                "Mean entropy of the policy over a minibatch, in nats, when the actor last learned; NaN before.",
             ),
             q: gauge("q", "Mean Q of a minibatch's own actions."),
             beta: gauge("beta", "Torque-limit multiplier of the stage."),
@@ -121,6 +127,10 @@ impl LearnerMetrics {
             promotions: counter("promotions_total", "Stages passed since this process started."),
             checkpoints: counter("checkpoints_total", "Checkpoints written since this process started."),
             checkpoint_seconds: seconds("checkpoint_seconds", "Time to write a checkpoint, beside training."),
+            filling: whole(
+                "filling",
+                "1 while the replay fills before the updates of a trained actor go on.",
+            ),
             finished: whole("finished", "1 once training is over."),
         }
     }

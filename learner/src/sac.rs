@@ -133,7 +133,7 @@ impl Sac {
             updates: 0,
             began_trained: false,
             td_errors: Vec::new(),
-            policy: PolicyLoss::default(),
+            policy: PolicyLoss::NONE,
             phases: Phases::default(),
             gradients: [None, None],
             cpu: OnCpu::Unknown,
@@ -379,11 +379,12 @@ impl Sac {
         let values = Values { actor: &actor, critics: &critics, targets: &targets };
         let bf16 = self.config.precision.is_bf16();
         let update = CpuUpdate::new(&self.actor.shape, &self.critics.body, bf16, self.threads, values);
-        if update.is_none() {
-            let precision = if bf16 { "bfloat16" } else { "float32" };
-            tracing::warn!(
+        let precision = if bf16 { "bfloat16" } else { "float32" };
+        match &update {
+            Some(_) => tracing::info!("updates multiply in {precision}"),
+            None => tracing::warn!(
                 "libtorch has no {precision} products for this processor: updates go through autograd, slowly"
-            );
+            ),
         }
         self.cpu = update.map_or(OnCpu::Absent, |update| OnCpu::Ready(Box::new(update)));
     }

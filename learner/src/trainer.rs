@@ -386,6 +386,7 @@ impl Trainer {
         self.metrics.stage_env_steps.set(stage_env_steps as i64);
         self.metrics.stage_limit_env_steps.set(stage_limit as i64);
         self.metrics.evaluations_outstanding.set(self.hub.outstanding() as i64);
+        self.metrics.filling.set(i64::from(self.refill.is_going_on()));
         self.metrics.finished.set(i64::from(self.ending.is_some()));
         let state = match self.ending {
             Some(_) => "finished",

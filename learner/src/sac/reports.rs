@@ -7,7 +7,7 @@ use std::time::Instant;
 pub struct Losses {
     /// Mean squared error of the critics, by the transitions' weights, summed over them.
     pub critic: f64,
-    /// Mean of α·log π − Q, of the last update that the actor learned by.
+    /// Mean of α·log π − Q, of the last update that the actor learned by; not a number before the first.
     pub actor: f64,
     /// α after the update.
     pub temperature: f64,
@@ -18,10 +18,15 @@ pub struct Losses {
 }
 
 /// What an update of the actor found; see [`Losses`].
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct PolicyLoss {
     pub(super) actor: f64,
     pub(super) entropy: f64,
+}
+
+impl PolicyLoss {
+    /// Of an actor that has not learned yet.
+    pub(super) const NONE: Self = Self { actor: f64::NAN, entropy: f64::NAN };
 }
 
 /// Where the time of updates went, in seconds since this process began. On a GPU, whose work is waited for at each loss, it
