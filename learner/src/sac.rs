@@ -213,12 +213,7 @@ impl Sac {
         self.lay_out();
         match std::mem::replace(&mut self.cpu, OnCpu::Absent) {
             OnCpu::Ready(mut cpu) => {
-                let pool = cpu.pool();
-                let mut update = || self.update_on_cpu(&mut cpu, batch, next_noise, noise);
-                let losses = match pool {
-                    Some(pool) => pool.install(update),
-                    None => update(),
-                };
+                let losses = self.update_on_cpu(&mut cpu, batch, next_noise, noise);
                 self.cpu = OnCpu::Ready(cpu);
                 losses
             }

@@ -1,6 +1,6 @@
 //! The update of SAC written out for processors: the same mathematics as [`crate::sac`]'s, without autograd.
 //!
-//! A minibatch is divided over the threads by transitions ([`worker`]). Each goes forward and back through every network
+//! A minibatch is divided over the threads ([`team`]) by transitions ([`worker`]). Each goes forward and back through every network
 //! ([`network`]; what a pass leaves is a [`trace`]) on products in bfloat16 or float32 ([`product`]). What is computed between
 //! two products ([`rows`], [`kernels`], [`math`]) goes straight into the layout that the next one reads ([`layout`]), for a
 //! few features at a time, while they are in the cache; in memory on huge pages ([`memory`]).
@@ -21,6 +21,7 @@ mod optimizer;
 mod product;
 mod rows;
 mod step;
+mod team;
 mod trace;
 mod update;
 mod weights;

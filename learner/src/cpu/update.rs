@@ -1,10 +1,8 @@
 //! One update of SAC on minibatches divided over threads.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 
 use getup_policy::{Body, ObservationStatistics, PolicyShape};
-use rayon::ThreadPool;
-use rayon::prelude::*;
 
 use super::layout::LANES;
 use super::memory::Memory;
@@ -12,15 +10,14 @@ use super::network::{Network, Ways};
 use super::optimizer::AdamStep;
 use super::product::Format;
 use super::step::{Flat, Gradients, Piece, Room, cut};
+use super::team::Team;
 use super::weights::Weights;
 use super::worker::{Networks, Worker};
 use crate::sac::Batch;
 
 /// Networks laid out for products, and the memory of an update.
 pub(crate) struct CpuUpdate {
-    /// None for one thread, which is the caller's.
-    pool: Option<Arc<ThreadPool>>,
-    threads: usize,
+    team: Team,
     actor: Network,
     critic: Network,
     actor_weights: Vec<Weights>,
@@ -89,15 +86,10 @@ impl CpuUpdate {
             let networks = values.chunks_exact(critic.length);
             networks.map(|one| critic.weights(one, differentiated, &mut memory)).collect()
         };
-        let pool = (threads > 1).then(|| {
-            let name = |index| format!("update-{index}");
-            rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build().ok()
-        });
         Some(Self {
             rooms,
             gradient_norms: [0.0; 2],
-            threads: if matches!(pool, Some(Some(_))) { threads } else { 1 },
-            pool: pool.flatten().map(Arc::new),
+            team: Team::new(threads),
             actor_weights,
             critic_weights: lay_out(values.critics, true),
             target_weights: lay_out(values.targets, false),
@@ -106,12 +98,6 @@ impl CpuUpdate {
             workers: Vec::new(),
             batch: 0,
         })
-    }
-
-    /// The threads, where there are several. What calls the update's phases from one of them spares the others' being put to
-    /// sleep and woken for each.
-    pub(crate) fn pool(&self) -> Option<Arc<ThreadPool>> {
-        self.pool.clone()
     }
 
     /// Critics' losses and gradients: y = r + γ (min Q'(s', a') − α log π(a'|s')), mean w (Q(s, a) − y)².
@@ -139,9 +125,9 @@ impl CpuUpdate {
         values: Values<'_>,
         work: impl Fn(&mut Worker, &Networks<'_>) + Send + Sync,
     ) -> Phase {
-        let Self { pool, actor, critic, actor_weights, critic_weights, target_weights, workers, .. } = self;
+        let Self { team, actor, critic, actor_weights, critic_weights, target_weights, workers, .. } = self;
         let networks = Networks { actor, critic, actor_weights, critic_weights, target_weights, values };
-        run(pool, workers, |worker| work(worker, &networks));
+        team.each(workers, |_, worker| work(worker, &networks));
         workers.iter().fold(Phase::default(), |sum, worker| sum.plus(&worker.phase))
     }
 
@@ -166,7 +152,7 @@ impl CpuUpdate {
             let target = Some((targets, target_weights));
             cut(critic, flat, gradients, weights, target, &mut pieces);
         }
-        self.gradient_norms[0] = take_steps(&self.pool, &self.rooms, &mut pieces, step, tau);
+        self.gradient_norms[0] = take_steps(&mut self.team, &self.rooms, &mut pieces, step, tau);
     }
 
     /// A step of AdamW along the actor's gradient.
@@ -177,7 +163,7 @@ impl CpuUpdate {
         };
         let mut pieces = Vec::new();
         cut(&self.actor, actor, &gradients, &mut self.actor_weights, None, &mut pieces);
-        self.gradient_norms[1] = take_steps(&self.pool, &self.rooms, &mut pieces, step, 0.0);
+        self.gradient_norms[1] = take_steps(&mut self.team, &self.rooms, &mut pieces, step, 0.0);
     }
 
     /// Euclidean norms of the last update's gradients: of all critics, of the actor.
@@ -188,9 +174,9 @@ impl CpuUpdate {
     /// The matrix products of one update on `batch` transitions and nothing else: its limit on this processor.
     pub(crate) fn multiply(&mut self, batch: usize) {
         self.lay_out(batch);
-        let Self { pool, actor, critic, actor_weights, critic_weights, target_weights, workers, .. } = self;
+        let Self { team, actor, critic, actor_weights, critic_weights, target_weights, workers, .. } = self;
         let first = Some(actor.inputs);
-        run(pool, workers, |worker| {
+        team.each(workers, |_, worker| {
             let Worker { actor: actor_trace, critics, scratch, critics_gradient, actor_gradient, .. } =
                 worker;
             let gradients = critics_gradient.chunks_exact_mut(critic.length);
@@ -214,7 +200,7 @@ impl CpuUpdate {
             return;
         }
         self.batch = batch;
-        let share = batch.div_ceil(self.threads).next_multiple_of(LANES);
+        let share = batch.div_ceil(self.team.threads()).next_multiple_of(LANES);
         let critics = self.critic_weights.len();
         let mut memory = Memory::default();
         let mut worker = |first: usize| {
@@ -225,25 +211,16 @@ impl CpuUpdate {
     }
 }
 
-/// Runs `work` on every item, on the pool where there is one.
-fn run<T: Send>(pool: &Option<Arc<ThreadPool>>, items: &mut [T], work: impl Fn(&mut T) + Send + Sync) {
-    match pool {
-        Some(pool) => pool.install(|| items.par_iter_mut().with_max_len(1).for_each(&work)),
-        None => items.iter_mut().for_each(work),
-    }
-}
-
 /// A step of every piece; the Euclidean norm of their gradient.
 fn take_steps(
-    pool: &Option<Arc<ThreadPool>>,
+    team: &mut Team,
     rooms: &[Mutex<Room>],
     pieces: &mut [Piece<'_>],
     step: AdamStep,
     tau: f32,
 ) -> f64 {
-    run(pool, pieces, |piece| {
-        let room = &rooms[rayon::current_thread_index().unwrap_or(0) % rooms.len()];
-        piece.step(&mut room.lock().unwrap_or_else(PoisonError::into_inner), step, tau);
+    team.each(pieces, |thread, piece| {
+        piece.step(&mut rooms[thread].lock().unwrap_or_else(PoisonError::into_inner), step, tau);
     });
     pieces.iter().map(Piece::squares).sum::<f64>().sqrt()
 }
