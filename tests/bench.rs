@@ -57,7 +57,7 @@ fn a_cluster_is_measured_by_a_table_of_its_own() {
     assert!(report["no_broadcast"].as_str().is_some_and(|why| !why.is_empty()), "{report}");
     assert_eq!(cluster.status().unwrap()["replay"]["transitions"], 0, "the run's table is untouched");
 
-    let _roles = ["learner", "actor"].map(|role| cluster.start(role, 1.0));
+    let _roles = ["learner", "actor"].map(|role| cluster.start(role, 1_000.0));
     wait_for("updates", LIMIT, || cluster.learner_metric("updates_total").filter(|updates| *updates >= 20.0));
     let report = measure();
     positive(&report["broadcast"], &["policies_per_second", "lag_p50_ms", "lag_p99_ms"]);

@@ -128,7 +128,8 @@ fn settings(endpoint: &str) -> [String; 4] {
 
 /// A cluster whose roles follow every segment.
 fn start(cluster: &Cluster, role: &'static str, endpoint: &str) -> Process {
-    let mut command = cluster.command(role, 1.0);
+    // Nothing passes its threshold: the run goes on until it is told to end.
+    let mut command = cluster.command(role, 1_000.0);
     command.args(settings(endpoint)).args(["--log-format", "json"]);
     Process::start(role, cluster.path(), &mut command)
 }
@@ -220,7 +221,7 @@ fn training_in_one_process_gives_the_same_traces_without_a_network() {
 fn nothing_is_exported_where_no_collector_is_configured() {
     let (cluster, collector) = (Cluster::new(), Collector::start());
     let start = |role| {
-        let mut command = cluster.command(role, 1.0);
+        let mut command = cluster.command(role, 1_000.0);
         // The settings decide, and not what other programs are told.
         command.env("OTEL_EXPORTER_OTLP_ENDPOINT", &collector.endpoint).args(["--log-format", "json"]);
         Process::start(role, cluster.path(), command.args(["--set", "traces.share=1"]))

@@ -54,7 +54,9 @@ fn pass(mut from: TcpStream, mut to: TcpStream, change: impl Fn(&mut [u8])) {
 #[test]
 fn actors_of_another_version_are_refused_while_the_others_are_restarted_and_train() {
     let cluster = Cluster::new();
-    let [replay, learner, mut actor] = ["replay", "learner", "actor"].map(|role| cluster.start(role, 1.0));
+    // Nothing passes this threshold: the run goes on until it is told to end.
+    let [replay, learner, mut actor] =
+        ["replay", "learner", "actor"].map(|role| cluster.start(role, 1_000.0));
     let trains = |what: &str| {
         wait_for(what, LIMIT, || cluster.learner_metric("updates_total").filter(|updates| *updates >= 1.0));
         let before = cluster.learner_metric("updates_total").unwrap_or(0.0);
@@ -99,7 +101,7 @@ fn actors_of_another_version_are_refused_while_the_others_are_restarted_and_trai
         // It waits for the role that is away, and is refused by whoever is back first.
         let old = start_old(&cluster, "older");
         assert!(process.wait(LIMIT).success(), "{}", process.log());
-        restarted.push(cluster.start(role, 1.0));
+        restarted.push(cluster.start(role, 1_000.0));
         is_refused(old, "sender");
         trains("after a restart");
     }

@@ -86,7 +86,10 @@ fn tile<const R: usize, const FUSED: bool>(
     let inputs = weight.len();
     let from = &from[..R * inputs];
     let mut sums = [[0.0f32; WIDTH]; R];
-    // By index: where this is unrolled, the sums stay in registers.
+    #[expect(
+        clippy::needless_range_loop,
+        reason = "by index, it is unrolled, and the sums stay in registers"
+    )]
     for (input, Weights(weight)) in weight.iter().enumerate() {
         for row in 0..R {
             // SAFETY: `row` is under `R`, `input` under `inputs`, and `from` has `R * inputs` numbers.
