@@ -9,8 +9,6 @@ use crate::Policy;
 
 /// Outputs that are summed up together: a few vectors.
 const WIDTH: usize = 32;
-/// The most rows that share a pass over the weights.
-const ROWS: usize = 8;
 
 /// What one input weighs in [`WIDTH`] outputs. A vector of it lies in one line of the cache.
 #[derive(Clone, Copy)]
@@ -59,24 +57,28 @@ impl Layer {
 fn multiply(from: &[f32], inputs: usize, weight: &[Weights], outputs: usize, to: &mut [f32]) {
     // Elsewhere a fused product and sum would be a call of a function.
     const FUSED: bool = selected_target!().supports_feature_str("fma") || cfg!(target_arch = "aarch64");
+    // Sums that the registers hold: of 32 vectors of 16, or of 16 vectors of 8.
+    const MANY: bool = selected_target!().supports_feature_str("avx512f");
     for (block, weight) in weight.chunks_exact(inputs).enumerate() {
         let first = block * WIDTH;
         let (mut from, mut to) = (from, &mut *to);
         while !from.is_empty() {
             let rows = match from.len() / inputs {
-                ROWS.. => tile::<ROWS, FUSED>(from, weight, outputs, first, to),
-                4.. => tile::<4, FUSED>(from, weight, outputs, first, to),
-                2.. => tile::<2, FUSED>(from, weight, outputs, first, to),
-                _ => tile::<1, FUSED>(from, weight, outputs, first, to),
+                8.. if MANY => tile::<8, WIDTH, FUSED>(from, weight, outputs, first, to),
+                6.. if !MANY => tile::<6, { WIDTH / 2 }, FUSED>(from, weight, outputs, first, to),
+                4.. if MANY => tile::<4, WIDTH, FUSED>(from, weight, outputs, first, to),
+                4.. => tile::<4, { WIDTH / 2 }, FUSED>(from, weight, outputs, first, to),
+                2.. => tile::<2, WIDTH, FUSED>(from, weight, outputs, first, to),
+                _ => tile::<1, WIDTH, FUSED>(from, weight, outputs, first, to),
             };
             (from, to) = (&from[rows * inputs..], &mut to[rows * outputs..]);
         }
     }
 }
 
-/// The outputs from `first` on that one block of weights gives, for the first `R` rows; `R`.
+/// The outputs from `first` on that one block of weights gives, `N` at a time, for the first `R` rows; `R`.
 #[inline(always)]
-fn tile<const R: usize, const FUSED: bool>(
+fn tile<const R: usize, const N: usize, const FUSED: bool>(
     from: &[f32],
     weight: &[Weights],
     outputs: usize,
@@ -85,24 +87,31 @@ fn tile<const R: usize, const FUSED: bool>(
 ) -> usize {
     let inputs = weight.len();
     let from = &from[..R * inputs];
-    let mut sums = [[0.0f32; WIDTH]; R];
-    #[expect(
-        clippy::needless_range_loop,
-        reason = "by index, it is unrolled, and the sums stay in registers"
-    )]
-    for (input, Weights(weight)) in weight.iter().enumerate() {
-        for row in 0..R {
-            // SAFETY: `row` is under `R`, `input` under `inputs`, and `from` has `R * inputs` numbers.
-            let x = unsafe { *from.get_unchecked(row * inputs + input) };
-            for output in 0..WIDTH {
-                let (weight, sum) = (weight[output], &mut sums[row][output]);
-                *sum = if FUSED { x.mul_add(weight, *sum) } else { *sum + x * weight };
+    for part in 0..WIDTH / N {
+        let part = part * N;
+        if first + part >= outputs {
+            break;
+        }
+        let mut sums = [[0.0f32; N]; R];
+        #[expect(
+            clippy::needless_range_loop,
+            reason = "by index, it is unrolled, and the sums stay in registers"
+        )]
+        for (input, Weights(weight)) in weight.iter().enumerate() {
+            let weight: &[f32; N] = weight[part..].first_chunk().expect("a part of the width");
+            for row in 0..R {
+                // SAFETY: `row` is under `R`, `input` under `inputs`, and `from` has `R * inputs` numbers.
+                let x = unsafe { *from.get_unchecked(row * inputs + input) };
+                for output in 0..N {
+                    let (weight, sum) = (weight[output], &mut sums[row][output]);
+                    *sum = if FUSED { x.mul_add(weight, *sum) } else { *sum + x * weight };
+                }
             }
         }
-    }
-    for (sums, row) in sums.iter().zip(to.chunks_exact_mut(outputs)) {
-        for (to, sum) in row[first..].iter_mut().zip(sums) {
-            *to += sum;
+        for (sums, row) in sums.iter().zip(to.chunks_exact_mut(outputs)) {
+            for (to, sum) in row[first + part..].iter_mut().zip(sums) {
+                *to += sum;
+            }
         }
     }
     R
