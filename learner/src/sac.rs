@@ -378,7 +378,8 @@ impl Sac {
         match &update {
             Some(_) => tracing::info!("updates multiply in {precision}"),
             None => tracing::warn!(
-                "libtorch has no {precision} products for this processor: updates go through autograd, slowly"
+                "libtorch has no {precision} products for this processor: updates go through autograd, many times slower; \
+                 sac.precision = \"auto\" multiplies in what there is"
             ),
         }
         self.cpu = update.map_or(OnCpu::Absent, |update| OnCpu::Ready(Box::new(update)));

@@ -116,3 +116,35 @@ fn tile<const R: usize, const N: usize, const FUSED: bool>(
     }
     R
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_row_gets_the_same_numbers_from_every_tile() {
+        /// One row after another, by itself; and all of them by tiles of `R` rows and `N` outputs.
+        fn check<const R: usize, const N: usize>(outputs: usize) {
+            const INPUTS: usize = 7;
+            let number = |seed: usize| (seed * 37 % 101) as f32 * 0.0173 - 0.8;
+            let weight: Vec<Weights> = (0..INPUTS)
+                .map(|i| Weights(std::array::from_fn(|output| number(i * WIDTH + output))))
+                .collect();
+            let from: Vec<f32> = (0..R * INPUTS).map(|i| number(i + 5)).collect();
+            let (mut alone, mut together) = (vec![0.5; R * outputs], vec![0.5; R * outputs]);
+            for (from, to) in from.chunks_exact(INPUTS).zip(alone.chunks_exact_mut(outputs)) {
+                assert_eq!(tile::<1, WIDTH, false>(from, &weight, outputs, 0, to), 1);
+            }
+            assert_eq!(tile::<R, N, false>(&from, &weight, outputs, 0, &mut together), R);
+            assert_eq!(alone, together, "{R} rows, {N} of {outputs} outputs");
+            let exact: f64 = (0..INPUTS).map(|i| f64::from(from[i]) * f64::from(weight[i].0[0])).sum();
+            assert!((f64::from(alone[0]) - 0.5 - exact).abs() < 1e-5, "{} for {exact}", alone[0]);
+        }
+        for outputs in [1, 15, 16, 21, WIDTH] {
+            check::<8, WIDTH>(outputs);
+            check::<6, { WIDTH / 2 }>(outputs);
+            check::<4, { WIDTH / 2 }>(outputs);
+            check::<2, WIDTH>(outputs);
+        }
+    }
+}

@@ -49,23 +49,22 @@ struct Rounded<'a> {
     signs: &'a mut [u32],
 }
 
-/// Which of the lanes are positive: a bit each, the even row's in the word's lower half. A NaN counts as positive, so that
-/// it goes on and is noticed.
+/// Which of the lanes are positive: a bit each. A NaN counts as positive, so that it goes on and is noticed.
 #[inline(always)]
-fn signs(even: &[f32], odd: &[f32]) -> u32 {
-    let positive = |value: &f32| u32::from(*value > 0.0 || value.is_nan());
-    let bits = |values: &[f32]| {
-        values.iter().enumerate().fold(0, |bits, (lane, value)| bits | positive(value) << lane)
-    };
-    bits(even) | bits(odd) << LANES
+fn signs(values: &[f32; LANES]) -> u32 {
+    let mut bits = [0; LANES];
+    for (lane, bits) in bits.iter_mut().enumerate() {
+        *bits = u32::from(values[lane] > 0.0 || values[lane].is_nan()) << lane;
+    }
+    bits.into_iter().fold(0, |all, bit| all | bit)
 }
 
 /// Rounds two parts.
 #[inline(always)]
 fn round(even: &[f32], odd: &[f32], to: &mut Rounded<'_>) {
-    let lanes = even.chunks_exact(LANES).zip(odd.chunks_exact(LANES));
+    let lanes = even.as_chunks().0.iter().zip(odd.as_chunks().0);
     for (to, (even, odd)) in to.signs.iter_mut().zip(lanes) {
-        *to = signs(even, odd);
+        *to = signs(even) | signs(odd) << LANES;
     }
     for (to, values) in [(&mut *to.even, even), (&mut *to.odd, odd)] {
         to.iter_mut().zip(values).for_each(|(to, value)| *to = bf16(*value));
@@ -313,8 +312,8 @@ pub(super) fn write_parts<R: Rows>(
                 continue;
             }
             let first = ((row - range.start) / 2 * length + at) / LANES;
-            for (word, values) in sign_words[first..].iter_mut().zip(values.chunks_exact(LANES)) {
-                *word = if row % 2 == 0 { signs(values, &[]) } else { *word | signs(&[], values) };
+            for (word, values) in sign_words[first..].iter_mut().zip(values.as_chunks().0) {
+                *word = if row % 2 == 0 { signs(values) } else { *word | signs(values) << LANES };
             }
         }
     }
@@ -329,10 +328,14 @@ pub(super) fn transpose(from: &[u32], rows: usize, columns: usize, to: &mut [u32
     let room = (columns - 1) * stride + rows;
     assert!(from.len() >= rows * columns && to.len() >= room && rows <= stride, "{rows} × {columns} words");
     #[cfg(target_arch = "x86_64")]
-    if is_x86_feature_detected!("avx512f") {
-        // SAFETY: the processor has AVX-512 F, and both slices hold rows × columns words at their strides (asserted).
-        unsafe { transpose_avx512(from, rows, columns, to, stride) };
-        return;
+    // SAFETY: the processor has what is asked for, and both slices hold rows × columns words at their strides (asserted).
+    unsafe {
+        if is_x86_feature_detected!("avx512f") {
+            return transpose_avx512(from, rows, columns, to, stride);
+        }
+        if is_x86_feature_detected!("avx2") {
+            return transpose_avx2(from, rows, columns, to, stride);
+        }
     }
     transpose_by_words(from, columns, to, stride, 0..rows, 0..columns);
 }
@@ -358,20 +361,88 @@ pub(super) fn transpose_by_words(
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
 unsafe fn transpose_avx512(from: &[u32], rows: usize, columns: usize, to: &mut [u32], stride: usize) {
-    let (whole_rows, whole_columns) = (rows - rows % LANES, columns - columns % LANES);
-    for row in (0..whole_rows).step_by(LANES) {
-        for column in (0..whole_columns).step_by(LANES) {
-            // SAFETY: the block's last word is (row + 15) · columns + column + 15 of `from` and its mirror of `to`,
+    // SAFETY: as the caller promises, of the whole and so of every block.
+    unsafe {
+        by_blocks::<16>([rows, columns], from, to, stride, |from, to| block_of_16(from, columns, to, stride))
+    }
+}
+
+/// # Safety
+/// The processor has AVX2, and both slices hold `rows · columns` words at their strides.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+pub(super) unsafe fn transpose_avx2(
+    from: &[u32],
+    rows: usize,
+    columns: usize,
+    to: &mut [u32],
+    stride: usize,
+) {
+    // SAFETY: as the caller promises, of the whole and so of every block.
+    unsafe {
+        by_blocks::<8>([rows, columns], from, to, stride, |from, to| block_of_8(from, columns, to, stride))
+    }
+}
+
+/// Gives `block` where each whole block of `N` × `N` words is and where it goes; the rest word by word.
+///
+/// # Safety
+/// Both slices hold `rows · columns` words at their strides.
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+unsafe fn by_blocks<const N: usize>(
+    [rows, columns]: [usize; 2],
+    from: &[u32],
+    to: &mut [u32],
+    stride: usize,
+    block: impl Fn(*const u32, *mut u32),
+) {
+    let (whole_rows, whole_columns) = (rows - rows % N, columns - columns % N);
+    for row in (0..whole_rows).step_by(N) {
+        for column in (0..whole_columns).step_by(N) {
+            // SAFETY: the block's last word is (row + N − 1) · columns + column + N − 1 of `from` and its mirror of `to`,
             // which are inside.
             unsafe {
                 let source = from.as_ptr().add(row * columns + column);
                 let target = to.as_mut_ptr().add(column * stride + row);
-                transpose_block(source, columns, target, stride);
+                block(source, target);
             }
         }
     }
     transpose_by_words(from, columns, to, stride, 0..rows, whole_columns..columns);
     transpose_by_words(from, columns, to, stride, whole_rows..rows, 0..whole_columns);
+}
+
+/// A block of 8 × 8 words.
+///
+/// # Safety
+/// The processor has AVX2; 8 rows of 8 words at the given strides are readable and writable.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+unsafe fn block_of_8(from: *const u32, from_stride: usize, to: *mut u32, to_stride: usize) {
+    // SAFETY: as the caller promises.
+    let row = |i: usize| unsafe { _mm256_loadu_si256(from.add(i * from_stride).cast()) };
+    // Afterwards register 4g + c holds, in each half p, column 4p + c of rows 4g..4g + 4.
+    let mut quads = [_mm256_setzero_si256(); 8];
+    for group in 0..2 {
+        let [a, b, c, d] = std::array::from_fn(|i| row(4 * group + i));
+        let (ab_low, ab_high) = (_mm256_unpacklo_epi32(a, b), _mm256_unpackhi_epi32(a, b));
+        let (cd_low, cd_high) = (_mm256_unpacklo_epi32(c, d), _mm256_unpackhi_epi32(c, d));
+        quads[4 * group] = _mm256_unpacklo_epi64(ab_low, cd_low);
+        quads[4 * group + 1] = _mm256_unpackhi_epi64(ab_low, cd_low);
+        quads[4 * group + 2] = _mm256_unpacklo_epi64(ab_high, cd_high);
+        quads[4 * group + 3] = _mm256_unpackhi_epi64(ab_high, cd_high);
+    }
+    for c in 0..4 {
+        let (top, bottom) = (quads[c], quads[4 + c]);
+        // SAFETY: as the caller promises: columns c and 4 + c are two of 8.
+        unsafe {
+            let low = _mm256_permute2x128_si256::<0x20>(top, bottom);
+            _mm256_storeu_si256(to.add(c * to_stride).cast(), low);
+            let high = _mm256_permute2x128_si256::<0x31>(top, bottom);
+            _mm256_storeu_si256(to.add((4 + c) * to_stride).cast(), high);
+        }
+    }
 }
 
 /// A block of 16 × 16 words.
@@ -380,8 +451,7 @@ unsafe fn transpose_avx512(from: &[u32], rows: usize, columns: usize, to: &mut [
 /// The processor has AVX-512 F; 16 rows of 16 words at the given strides are readable and writable.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
-unsafe fn transpose_block(from: *const u32, from_stride: usize, to: *mut u32, to_stride: usize) {
-    use std::arch::x86_64::*;
+unsafe fn block_of_16(from: *const u32, from_stride: usize, to: *mut u32, to_stride: usize) {
     // SAFETY: as the caller promises.
     let row = |i: usize| unsafe { _mm512_loadu_si512(from.add(i * from_stride).cast()) };
     // 32-bit, then 64-bit neighbours: afterwards register 4g + c holds, in each 128-bit part p, column 4p + c of

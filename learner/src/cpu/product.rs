@@ -71,19 +71,24 @@ fn has_avx512() -> bool {
 /// A block of a right factor with its rows beside each other, in the first cache. oneDNN's kernels for AVX2 take twice as long
 /// for a factor whose rows are 1024 numbers apart.
 #[repr(align(64))]
-struct Panel([u32; Self::TERMS * Self::COLUMNS]);
+pub(super) struct Panel([u32; Self::TERMS * Self::COLUMNS]);
 
 impl Panel {
     const TERMS: usize = 256;
     const COLUMNS: usize = 32;
 
+    /// Zeros.
+    pub(super) fn new() -> Self {
+        Self([0; Self::TERMS * Self::COLUMNS])
+    }
+
     /// One where it is worth the copies, found by measuring on a Zen 3.
     fn for_product(format: Format, Size { m, n, k }: Size) -> Option<Self> {
         let worth = format == Format::F32 && m >= 16 && n >= 256 && k >= 256 && !has_avx512();
-        worth.then_some(Self([0; Self::TERMS * Self::COLUMNS]))
+        worth.then(Self::new)
     }
 
-    /// Holds `[terms, columns]` words of a factor whose rows are `stride` apart; them, and their own stride.
+    /// Takes `[terms, columns]` words of a factor whose rows are `stride` apart; them, and their own stride.
     fn copy(&mut self, from: &[u32], stride: usize, [terms, columns]: [usize; 2]) -> (&[u32], usize) {
         for (to, from) in self.0.chunks_exact_mut(columns).zip(from.chunks(stride)).take(terms) {
             to.copy_from_slice(&from[..columns]);
@@ -183,13 +188,23 @@ impl Product {
     }
 
     fn try_run(&self, a: &[u32], b: &[u32], c: &mut [f32]) -> bool {
+        self.run_by_blocks(a, b, c, Panel::for_product(self.format, self.size))
+    }
+
+    /// [`Product::run`], by a panel where there is one, in float32; whether libtorch has a kernel.
+    pub(super) fn run_by_blocks(
+        &self,
+        a: &[u32],
+        b: &[u32],
+        c: &mut [f32],
+        mut panel: Option<Panel>,
+    ) -> bool {
         let Self { format, size: Size { m, n, k }, lda, ldb, ldc, accumulate } = *self;
         if m * n * k == 0 {
             return true;
         }
         let per_word = format.per_word();
         assert!(k % per_word == 0 && lda % per_word == 0 && k <= lda && n <= ldb && n <= ldc, "{self:?}");
-        let mut panel = Panel::for_product(format, self.size);
         let [rows, columns, terms] = match &panel {
             Some(_) => [format.block()[0], Panel::COLUMNS, Panel::TERMS],
             None => format.block(),

@@ -159,13 +159,13 @@ impl Rows for Gradient<'_> {
             Passed::Signs(signs) => {
                 let signs = &signs[(row / 2 * self.rows + at) / LANES..];
                 let shift = row % 2 * LANES;
-                for ((to, values), word) in
-                    to.chunks_exact_mut(LANES).zip(values.chunks_exact(LANES)).zip(signs)
-                {
-                    let bits = word >> shift;
-                    for lane in 0..LANES {
-                        to[lane] = if bits & (1 << lane) != 0 { values[lane] } else { 0.0 };
-                    }
+                let lanes = to.as_chunks_mut::<LANES>().0.iter_mut().zip(values.as_chunks::<LANES>().0);
+                for ((to, values), word) in lanes.zip(signs) {
+                    // Arrays and masks, not conditions: vectors come of them.
+                    let (bits, values) = (word >> shift, *values);
+                    let passed: [u32; LANES] =
+                        std::array::from_fn(|lane| 0u32.wrapping_sub(bits >> lane & 1));
+                    *to = std::array::from_fn(|lane| f32::from_bits(values[lane].to_bits() & passed[lane]));
                 }
                 to
             }

@@ -8,7 +8,7 @@ use super::factors::{Factors, Purpose, Right};
 use super::layout::{self, Layout, Places};
 use super::memory::Memory;
 use super::optimizer::{self, AdamRows, AdamStep, PolyakRows};
-use super::product::{Format, Product, Size};
+use super::product::{Format, Panel, Product, Size};
 use super::rows::{AsTheyAre, BiasRelu, Gradient, Normal, Passed, Rows};
 use crate::config::{NetworkKind, Precision, SacConfig};
 use crate::parameters::to_vec;
@@ -156,7 +156,7 @@ fn a_product_is_that_of_the_rounded_numbers_in_one_block_and_in_many() {
             continue;
         }
         let rounded = |value: f32| if format == Format::Bf16 { round(value) } else { value };
-        for (m, n, k) in [(5, 16, 7), (600, 48, 31), (7, 528, 600), (70, 32, 1100)] {
+        for (m, n, k) in [(5, 16, 7), (600, 48, 31), (7, 528, 600), (70, 32, 1100), (20, 272, 300)] {
             let (a, b) = (random(m * k, -1.0, 1.0, &mut rng), random(k * n, -1.0, 1.0, &mut rng));
             let memory = &mut Memory::default();
             let (mut right, mut factors) =
@@ -183,6 +183,15 @@ fn a_product_is_that_of_the_rounded_numbers_in_one_block_and_in_many() {
                     &mut result,
                 );
             }
+            if format == Format::F32 {
+                let mut by_panel = vec![1.0; m * n];
+                for accumulate in [false, true] {
+                    let product = Product { format, size, lda: padded, ldb: n, ldc: n, accumulate };
+                    assert!(product.run_by_blocks(&left, right.words(), &mut by_panel, Some(Panel::new())));
+                }
+                let difference = largest_difference(&by_panel, &result);
+                assert!(difference < 1e-3, "{m} × {n} × {k}: {difference}");
+            }
             for row in 0..m {
                 for column in 0..n {
                     let term =
@@ -205,6 +214,13 @@ fn words_are_transposed_whatever_the_sides() {
             layout::transpose(&words, rows, columns, &mut turned, stride);
             layout::transpose_by_words(&words, columns, &mut plainly, stride, 0..rows, 0..columns);
             assert_eq!(turned, plainly, "{rows} × {columns}");
+            #[cfg(target_arch = "x86_64")]
+            if is_x86_feature_detected!("avx2") {
+                let mut narrowly = vec![7; stride * columns];
+                // SAFETY: the processor has AVX2, and both hold rows × columns words at their strides.
+                unsafe { layout::transpose_avx2(&words, rows, columns, &mut narrowly, stride) };
+                assert_eq!(narrowly, plainly, "{rows} × {columns}");
+            }
             for (place, word) in turned.iter().enumerate() {
                 let (column, row) = (place / stride, place % stride);
                 let wanted = if row < rows { words[row * columns + column] } else { 7 };
