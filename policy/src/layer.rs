@@ -10,6 +10,11 @@ use crate::Policy;
 /// Outputs that are summed up together: a few vectors.
 const WIDTH: usize = 32;
 
+/// Rows that share a pass over the weights.
+const ROWS: usize = 16;
+/// Inputs whose weights, 16 KiB, stay in the first cache from rows to rows.
+const INPUTS: usize = 128;
+
 /// What one input weighs in [`WIDTH`] outputs. A vector of it lies in one line of the cache.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
@@ -61,60 +66,85 @@ fn multiply(from: &[f32], inputs: usize, weight: &[Weights], outputs: usize, to:
     const MANY: bool = selected_target!().supports_feature_str("avx512f");
     for (block, weight) in weight.chunks_exact(inputs).enumerate() {
         let first = block * WIDTH;
-        let (mut from, mut to) = (from, &mut *to);
-        while !from.is_empty() {
-            let rows = match from.len() / inputs {
-                8.. if MANY => tile::<8, WIDTH, FUSED>(from, weight, outputs, first, to),
-                6.. if !MANY => tile::<6, { WIDTH / 2 }, FUSED>(from, weight, outputs, first, to),
-                4.. if MANY => tile::<4, WIDTH, FUSED>(from, weight, outputs, first, to),
-                4.. => tile::<4, { WIDTH / 2 }, FUSED>(from, weight, outputs, first, to),
-                2.. => tile::<2, WIDTH, FUSED>(from, weight, outputs, first, to),
-                _ => tile::<1, WIDTH, FUSED>(from, weight, outputs, first, to),
-            };
-            (from, to) = (&from[rows * inputs..], &mut to[rows * outputs..]);
+        for (from, to) in from.chunks(ROWS * inputs).zip(to.chunks_mut(ROWS * outputs)) {
+            let (rows, mut sums) = (to.len() / outputs, [[0.0; WIDTH]; ROWS]);
+            for (index, weight) in weight.chunks(INPUTS).enumerate() {
+                let mut row = 0;
+                while row < rows {
+                    let (from, sums) = (&from[row * inputs + index * INPUTS..], &mut sums[row..rows]);
+                    // The first rows fetch the next inputs' weights, so that nobody waits for memory.
+                    let fetches = row == 0;
+                    row += match sums.len() {
+                        8.. if MANY => tile::<8, WIDTH, FUSED>(from, inputs, weight, sums, fetches),
+                        6.. if !MANY => tile::<6, { WIDTH / 2 }, FUSED>(from, inputs, weight, sums, fetches),
+                        4.. if MANY => tile::<4, WIDTH, FUSED>(from, inputs, weight, sums, fetches),
+                        4.. => tile::<4, { WIDTH / 2 }, FUSED>(from, inputs, weight, sums, fetches),
+                        2.. => tile::<2, WIDTH, FUSED>(from, inputs, weight, sums, fetches),
+                        _ => tile::<1, WIDTH, FUSED>(from, inputs, weight, sums, fetches),
+                    };
+                }
+            }
+            for (sums, row) in sums.iter().zip(to.chunks_exact_mut(outputs)) {
+                row[first..].iter_mut().zip(sums).for_each(|(to, sum)| *to += sum);
+            }
         }
     }
 }
 
-/// The outputs from `first` on that one block of weights gives, `N` at a time, for the first `R` rows; `R`.
+/// Adds what some inputs weigh to the first `R` rows' sums, `N` outputs at a time; `R`. `from` begins with the first of these
+/// inputs; its rows are `inputs` apart.
 #[inline(always)]
 fn tile<const R: usize, const N: usize, const FUSED: bool>(
     from: &[f32],
+    inputs: usize,
     weight: &[Weights],
-    outputs: usize,
-    first: usize,
-    to: &mut [f32],
+    sums: &mut [[f32; WIDTH]],
+    fetches: bool,
 ) -> usize {
-    let inputs = weight.len();
-    let from = &from[..R * inputs];
+    let from = &from[..(R - 1) * inputs + weight.len()];
+    let sums: &mut [[f32; WIDTH]; R] = sums.first_chunk_mut().expect("as many rows");
     for part in 0..WIDTH / N {
-        let part = part * N;
-        if first + part >= outputs {
-            break;
-        }
-        let mut sums = [[0.0f32; N]; R];
+        let mut now: [[f32; N]; R] =
+            std::array::from_fn(|row| *sums[row][part * N..].first_chunk().expect("a part"));
         #[expect(
             clippy::needless_range_loop,
             reason = "by index, it is unrolled, and the sums stay in registers"
         )]
         for (input, Weights(weight)) in weight.iter().enumerate() {
-            let weight: &[f32; N] = weight[part..].first_chunk().expect("a part of the width");
+            if part == 0 && fetches {
+                fetch(weight.as_ptr().wrapping_add(INPUTS * WIDTH));
+            }
+            let weight: &[f32; N] = weight[part * N..].first_chunk().expect("a part");
             for row in 0..R {
-                // SAFETY: `row` is under `R`, `input` under `inputs`, and `from` has `R * inputs` numbers.
+                // SAFETY: `row` is under `R`, `input` under `weight.len()`, and `from` reaches to the last of both.
                 let x = unsafe { *from.get_unchecked(row * inputs + input) };
                 for output in 0..N {
-                    let (weight, sum) = (weight[output], &mut sums[row][output]);
+                    let (weight, sum) = (weight[output], &mut now[row][output]);
                     *sum = if FUSED { x.mul_add(weight, *sum) } else { *sum + x * weight };
                 }
             }
         }
-        for (sums, row) in sums.iter().zip(to.chunks_exact_mut(outputs)) {
-            for (to, sum) in row[first + part..].iter_mut().zip(sums) {
-                *to += sum;
-            }
+        for (sums, now) in sums.iter_mut().zip(now) {
+            sums[part * N..][..N].copy_from_slice(&now);
         }
     }
     R
+}
+
+/// Asks for an input's weights, wherever that is: they come into the first cache while other work goes on.
+#[inline(always)]
+fn fetch(weights: *const f32) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: a hint that reads nothing: any address will do.
+        unsafe {
+            _mm_prefetch::<_MM_HINT_T0>(weights.cast());
+            _mm_prefetch::<_MM_HINT_T0>(weights.wrapping_add(WIDTH / 2).cast());
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = weights;
 }
 
 #[cfg(test)]
@@ -123,28 +153,27 @@ mod tests {
 
     #[test]
     fn a_row_gets_the_same_numbers_from_every_tile() {
-        /// One row after another, by itself; and all of them by tiles of `R` rows and `N` outputs.
-        fn check<const R: usize, const N: usize>(outputs: usize) {
+        /// One row after another, by itself; and `R` rows together, `N` outputs at a time.
+        fn check<const R: usize, const N: usize>() {
             const INPUTS: usize = 7;
             let number = |seed: usize| (seed * 37 % 101) as f32 * 0.0173 - 0.8;
-            let weight: Vec<Weights> = (0..INPUTS)
-                .map(|i| Weights(std::array::from_fn(|output| number(i * WIDTH + output))))
-                .collect();
+            let weights = |i: usize| Weights(std::array::from_fn(|output| number(i * WIDTH + output)));
+            let weights: Vec<Weights> = (0..INPUTS).map(weights).collect();
             let from: Vec<f32> = (0..R * INPUTS).map(|i| number(i + 5)).collect();
-            let (mut alone, mut together) = (vec![0.5; R * outputs], vec![0.5; R * outputs]);
-            for (from, to) in from.chunks_exact(INPUTS).zip(alone.chunks_exact_mut(outputs)) {
-                assert_eq!(tile::<1, WIDTH, false>(from, &weight, outputs, 0, to), 1);
+            let (mut alone, mut together) = ([[0.5; WIDTH]; R], [[0.5; WIDTH]; R]);
+            for (from, sums) in from.chunks_exact(INPUTS).zip(&mut alone) {
+                let sums = std::slice::from_mut(sums);
+                assert_eq!(tile::<1, WIDTH, false>(from, INPUTS, &weights, sums, false), 1);
             }
-            assert_eq!(tile::<R, N, false>(&from, &weight, outputs, 0, &mut together), R);
-            assert_eq!(alone, together, "{R} rows, {N} of {outputs} outputs");
-            let exact: f64 = (0..INPUTS).map(|i| f64::from(from[i]) * f64::from(weight[i].0[0])).sum();
-            assert!((f64::from(alone[0]) - 0.5 - exact).abs() < 1e-5, "{} for {exact}", alone[0]);
+            assert_eq!(tile::<R, N, false>(&from, INPUTS, &weights, &mut together, true), R);
+            assert_eq!(alone, together, "{R} rows, {N} outputs at a time");
+            let exact: f64 = (0..INPUTS).map(|i| f64::from(from[i]) * f64::from(weights[i].0[0])).sum();
+            assert!((f64::from(alone[0][0]) - 0.5 - exact).abs() < 1e-5, "{} for {exact}", alone[0][0]);
         }
-        for outputs in [1, 15, 16, 21, WIDTH] {
-            check::<8, WIDTH>(outputs);
-            check::<6, { WIDTH / 2 }>(outputs);
-            check::<4, { WIDTH / 2 }>(outputs);
-            check::<2, WIDTH>(outputs);
-        }
+        check::<8, WIDTH>();
+        check::<6, { WIDTH / 2 }>();
+        check::<4, WIDTH>();
+        check::<4, { WIDTH / 2 }>();
+        check::<2, WIDTH>();
     }
 }
