@@ -111,10 +111,10 @@ fn tile<const R: usize, const N: usize, const FUSED: bool>(
             reason = "by index, it is unrolled, and the sums stay in registers"
         )]
         for (input, Weights(weight)) in weight.iter().enumerate() {
-            if part == 0 && fetches {
-                fetch(weight.as_ptr().wrapping_add(INPUTS * WIDTH));
-            }
             let weight: &[f32; N] = weight[part * N..].first_chunk().expect("a part");
+            if fetches {
+                fetch(weight.as_ptr().wrapping_add(INPUTS * WIDTH), N);
+            }
             for row in 0..R {
                 // SAFETY: `row` is under `R`, `input` under `weight.len()`, and `from` reaches to the last of both.
                 let x = unsafe { *from.get_unchecked(row * inputs + input) };
@@ -131,20 +131,19 @@ fn tile<const R: usize, const N: usize, const FUSED: bool>(
     R
 }
 
-/// Asks for an input's weights, wherever that is: they come into the first cache while other work goes on.
+/// Asks for some weights, wherever that is: they come into the first cache while other work goes on.
 #[inline(always)]
-fn fetch(weights: *const f32) {
+fn fetch(weights: *const f32, count: usize) {
+    /// Numbers in a line of the cache.
+    const LINE: usize = 16;
     #[cfg(target_arch = "x86_64")]
-    {
+    for line in (0..count).step_by(LINE) {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
         // SAFETY: a hint that reads nothing: any address will do.
-        unsafe {
-            _mm_prefetch::<_MM_HINT_T0>(weights.cast());
-            _mm_prefetch::<_MM_HINT_T0>(weights.wrapping_add(WIDTH / 2).cast());
-        }
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(weights.wrapping_add(line).cast()) };
     }
     #[cfg(not(target_arch = "x86_64"))]
-    let _ = weights;
+    let _ = (weights, count, LINE);
 }
 
 #[cfg(test)]
