@@ -60,6 +60,7 @@ impl Format {
     }
 }
 
+/// Whether oneDNN's float32 kernels are those for AVX-512.
 fn has_avx512() -> bool {
     #[cfg(target_arch = "x86_64")]
     let has = is_x86_feature_detected!("avx512f");
@@ -205,6 +206,7 @@ impl Product {
         }
         let per_word = format.per_word();
         assert!(k % per_word == 0 && lda % per_word == 0 && k <= lda && n <= ldb && n <= ldc, "{self:?}");
+        assert!(panel.is_none() || format == Format::F32, "a panel holds float32: {self:?}");
         let [rows, columns, terms] = match &panel {
             Some(_) => [format.block()[0], Panel::COLUMNS, Panel::TERMS],
             None => format.block(),
