@@ -16,6 +16,7 @@ use super::layout::{self, CHUNK, LANES, Layout, Places, chunks};
 use super::memory::{Buffer, Memory};
 use super::product::{Format, Product, Size};
 use super::rows::{Passed, Rows};
+use super::transpose;
 
 /// What a pass forward is for, and so what it keeps for the way back.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -95,7 +96,7 @@ impl Factors {
             if learns {
                 let words = self.rows / self.format.per_word();
                 let to = &mut self.columns[features.start..];
-                layout::transpose(kept, features.len(), words, to, Self::column_stride(self.inputs));
+                transpose::transpose(kept, features.len(), words, to, Self::column_stride(self.inputs));
             }
         }
     }
@@ -189,7 +190,7 @@ impl HeadFactors {
     pub(super) fn pack_gradient(&mut self, gradient: &[f32]) {
         let rows = gradient.len() / self.outputs;
         let words = bytemuck::cast_slice(gradient);
-        layout::transpose(words, self.outputs, rows, &mut self.columns, self.outputs);
+        transpose::transpose(words, self.outputs, rows, &mut self.columns, self.outputs);
     }
 
     /// The weights' gradient, turned, for some outputs: `to = X·dYᵀ` or `to += X·dYᵀ`, `[inputs, outputs]`.

@@ -2,7 +2,7 @@
 //!
 //! A minibatch is divided over the threads ([`team`]) by transitions ([`worker`]). Each goes forward and back through every network
 //! ([`network`]; what a pass leaves is a [`trace`]) on products in bfloat16 or float32 ([`product`]). What is computed between
-//! two products ([`rows`], [`kernels`], [`math`]) goes straight into the layout that the next one reads ([`layout`]), for a
+//! two products ([`rows`], [`kernels`], [`math`]) goes straight into the layout that the next one reads ([`layout`], [`transpose`]), for a
 //! few features at a time, while they are in the cache; in memory on huge pages ([`memory`]).
 //!
 //! Passes leave the weights' gradients as their [`factors`]. One pass over the parameters ([`step`]) makes a few outputs'
@@ -23,6 +23,7 @@ mod rows;
 mod step;
 mod team;
 mod trace;
+mod transpose;
 mod update;
 mod weights;
 mod worker;

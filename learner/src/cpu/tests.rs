@@ -10,6 +10,7 @@ use super::memory::Memory;
 use super::optimizer::{self, AdamRows, AdamStep, PolyakRows};
 use super::product::{Format, Panel, Product, Size};
 use super::rows::{AsTheyAre, BiasRelu, Gradient, Normal, Passed, Rows};
+use super::transpose;
 use crate::config::{NetworkKind, Precision, SacConfig};
 use crate::parameters::to_vec;
 use crate::sac::{Batch, Losses, Sac, TaskShape};
@@ -211,14 +212,14 @@ fn words_are_transposed_whatever_the_sides() {
         let (rows, columns) = (rows as usize, columns as usize);
         for stride in [rows, rows + 5] {
             let (mut turned, mut plainly) = (vec![7; stride * columns], vec![7; stride * columns]);
-            layout::transpose(&words, rows, columns, &mut turned, stride);
-            layout::transpose_by_words(&words, columns, &mut plainly, stride, 0..rows, 0..columns);
+            transpose::transpose(&words, rows, columns, &mut turned, stride);
+            transpose::transpose_by_words(&words, columns, &mut plainly, stride, 0..rows, 0..columns);
             assert_eq!(turned, plainly, "{rows} × {columns}");
             #[cfg(target_arch = "x86_64")]
             if is_x86_feature_detected!("avx2") {
                 let mut narrowly = vec![7; stride * columns];
                 // SAFETY: the processor has AVX2, and both hold rows × columns words at their strides.
-                unsafe { layout::transpose_avx2(&words, rows, columns, &mut narrowly, stride) };
+                unsafe { transpose::transpose_avx2(&words, rows, columns, &mut narrowly, stride) };
                 assert_eq!(narrowly, plainly, "{rows} × {columns}");
             }
             for (place, word) in turned.iter().enumerate() {

@@ -3,10 +3,10 @@
 use std::ops::Range;
 
 use super::factors::{Factors, HeadFactors, Right};
-use super::layout;
 use super::memory::{Buffer, Memory};
 use super::network::{Layer, Linear, Network};
 use super::product::Format;
+use super::transpose;
 
 /// What the heads read, `[width, R]`.
 pub(super) fn features(layers: &[Saved]) -> &[f32] {
@@ -112,7 +112,7 @@ impl Trace {
         if !turned.is_empty() {
             let (columns, rows) = (outputs.len(), turned.len() / outputs.len());
             let (turned, to) = (bytemuck::cast_slice(turned), bytemuck::cast_slice_mut(to));
-            layout::transpose(turned, rows, columns, to, rows);
+            transpose::transpose(turned, rows, columns, to, rows);
         }
     }
 }

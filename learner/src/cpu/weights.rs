@@ -6,6 +6,7 @@ use super::layout::{self, CHUNK, Layout, Places, chunks};
 use super::memory::{Buffer, Memory};
 use super::product::{Format, Product, Size};
 use super::rows::Rows;
+use super::transpose;
 
 /// The weights of a layer, `[outputs, inputs]`, laid out for products.
 pub(super) struct Weights {
@@ -73,7 +74,7 @@ impl Part {
             let pairs = if self.pairs.is_empty() { &*plain } else { &self.pairs };
             let stride = format.padded(self.outputs.len()) / per_word;
             let to = &mut self.transposed[first / per_word..];
-            layout::transpose(pairs, format.padded(count) / per_word, inputs, to, stride);
+            transpose::transpose(pairs, format.padded(count) / per_word, inputs, to, stride);
         }
     }
 }

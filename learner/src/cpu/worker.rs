@@ -6,10 +6,11 @@ use getup_policy::ObservationStatistics;
 
 use super::factors::Purpose;
 use super::kernels::{self, Motor};
-use super::layout::{self, LANES};
+use super::layout::LANES;
 use super::memory::{Buffer, Memory};
 use super::network::Network;
 use super::trace::{Scratch, Trace};
+use super::transpose;
 use super::update::{Inputs, Phase, Values};
 use super::weights::Weights;
 
@@ -102,7 +103,7 @@ impl Worker {
             staging[..rows.len() * width].copy_from_slice(&from[rows.start * width..rows.end * width]);
             staging[rows.len() * width..padded * width].fill(0.0);
             let words: &[u32] = bytemuck::cast_slice(&staging[..padded * width]);
-            layout::transpose(words, padded, width, bytemuck::cast_slice_mut(to), padded);
+            transpose::transpose(words, padded, width, bytemuck::cast_slice_mut(to), padded);
         };
         load(&batch.observation, observation, &mut self.now[..split]);
         load(&batch.action, action, &mut self.now[split..]);
@@ -159,7 +160,7 @@ impl Worker {
         self.staging[..noise.len()].copy_from_slice(noise);
         self.staging[noise.len()..action * padded].fill(0.0);
         let words: &[u32] = bytemuck::cast_slice(&self.staging[..action * padded]);
-        layout::transpose(words, padded, action, bytemuck::cast_slice_mut(&mut self.noise), padded);
+        transpose::transpose(words, padded, action, bytemuck::cast_slice_mut(&mut self.noise), padded);
 
         let (observations, actions) = self.now.split_at_mut(split);
         let (trace, scratch) = (&mut self.actor, &mut self.scratch);
