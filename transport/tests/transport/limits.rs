@@ -1,10 +1,8 @@
 //! What a port lets its peers take.
 
-mod common;
-
 use std::time::Duration;
 
-use common::{Folder, PATIENCE, Port, call, channel, eventually, refusal};
+use crate::support::{Folder, PATIENCE, Port, call, channel, eventually, refusal};
 use getup_transport::{ChannelOptions, Credentials, Limits, SecurityConfig, generate_token, make_authority};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;

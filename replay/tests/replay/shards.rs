@@ -1,10 +1,7 @@
 //! Several services behind one source.
 
-mod common;
-mod fixtures;
-
-use common::{Replay, config, eventually, options};
-use fixtures::{segment, spec};
+use crate::common::{Replay, config, eventually, options};
+use crate::fixtures::{segment, spec};
 use getup_replay::{ItemSelector, MinibatchSource, RemoteOptions, ReplayConfig, SampleError, ShardedSource};
 use getup_telemetry::{Registry, Shutdown, Waits};
 use getup_transport::Endpoint;

@@ -1,10 +1,7 @@
 //! Stores that draw otherwise than uniformly, in process and over gRPC.
 
-mod common;
-mod fixtures;
-
-use common::{PATIENCE, Replay, config, eventually, open, options};
-use fixtures::{get_up_spec, segment, spec, value};
+use crate::common::{self, PATIENCE, Replay, config, eventually, open, options};
+use crate::fixtures::{get_up_spec, segment, spec, value};
 use getup_proto::v1::append_request::Message;
 use getup_proto::v1::replay_client::ReplayClient;
 use getup_proto::{RunSpec, v1};

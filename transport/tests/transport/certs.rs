@@ -1,10 +1,8 @@
 //! Certificates that are made here.
 
-mod common;
-
 use std::os::unix::fs::PermissionsExt;
 
-use common::Folder;
+use crate::support::Folder;
 use getup_transport::{Credentials, Issued, make_authority};
 
 fn names(names: &[&str]) -> Vec<String> {

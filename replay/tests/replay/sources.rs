@@ -1,10 +1,7 @@
 //! One suite of assertions for both ways to sample: in the same process, and over gRPC.
 
-mod common;
-mod fixtures;
-
-use common::{Replay, config, eventually, options};
-use fixtures::{Ending, Part, segment, spec, value};
+use crate::common::{Replay, config, eventually, options};
+use crate::fixtures::{Ending, Part, segment, spec, value};
 use getup_proto::columns;
 use getup_replay::{
     LocalSource, Minibatch, MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, ReplayMetrics,

@@ -1,10 +1,7 @@
 //! Peers and disks that fail: back-pressure, a clear word, and nothing lost that was acknowledged.
 
-mod common;
-mod fixtures;
-
-use common::{PATIENCE, Replay, Writer, config, eventually, hello, open, options};
-use fixtures::{get_up_spec, segment, spec};
+use crate::common::{self, PATIENCE, Replay, Writer, config, eventually, hello, open, options};
+use crate::fixtures::{get_up_spec, segment, spec};
 use getup_proto::v1;
 use getup_replay::{MinibatchSource, ReplayConfig, Survey, describe};
 use std::fs;

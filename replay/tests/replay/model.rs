@@ -1,10 +1,7 @@
 //! Random sequences of appends, samples, priorities, removals and restarts, against a plain list in memory.
 
-mod common;
-mod fixtures;
-
-use common::{config, open};
-use fixtures::{Ending, Part, spec};
+use crate::common::{config, open};
+use crate::fixtures::{Ending, Part, spec};
 use getup_proto::Segment;
 use getup_replay::{ItemSelector, Remover, ReplayConfig, SampleOptions, Sampler, Store, compact, segments};
 use proptest::prelude::*;

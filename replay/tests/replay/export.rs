@@ -1,8 +1,6 @@
 //! What is exported reads back as it was written: by NumPy and by Minari, where a Python has them.
 
-mod fixtures;
-
-use fixtures::{Ending, Part};
+use crate::fixtures::{self, Ending, Part};
 use getup_proto::{ColumnSpec, Rows, RunSpec, Segment, columns};
 use getup_replay::{DatasetId, export_minari, export_npz};
 use serde_json::{Value, json};
@@ -127,7 +125,7 @@ fn facts(spec: &RunSpec, segments: &[Segment]) -> Value {
 
 fn check(format: &str, path: &Path, facts: &Path) {
     let python = std::env::var("GETUP_TEST_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/export_check.py");
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/replay/export_check.py");
     let output = match Command::new(&python).arg(script).arg(format).arg(path).arg(facts).output() {
         Ok(output) => output,
         Err(error) => return eprintln!("not checked, {python} does not start: {error}"),

@@ -4,11 +4,9 @@
 //! Half of the inputs are valid ones with some bytes changed, cut out or repeated; the others are noise. A thousand
 //! inputs each by default, half a million each with `GETUP_TEST_FULL`.
 
-mod common;
-mod fixtures;
-
+use crate::common;
+use crate::fixtures::{self, Ending, Part, get_up_spec, spec};
 use bytes::{Buf, BufMut, Bytes};
-use fixtures::{Ending, Part, get_up_spec, spec};
 use getup_proto::{RunSpec, Segment, v1};
 use getup_replay::{SampleOptions, Survey};
 use prost::Message;

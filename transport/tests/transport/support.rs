@@ -1,5 +1,4 @@
 //! A port that serves the health service, and clients of it.
-#![allow(dead_code, unreachable_pub, reason = "each test uses a part of it")]
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -16,21 +15,21 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
 
 /// Longer than anything should take.
-pub const PATIENCE: Duration = Duration::from_secs(15);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(15);
 
 /// A port on a loopback, until it is dropped.
-pub struct Port {
-    pub address: SocketAddr,
+pub(crate) struct Port {
+    pub(crate) address: SocketAddr,
     registry: Registry,
     shutdown: Shutdown,
 }
 
 impl Port {
-    pub async fn open(config: &SecurityConfig) -> Self {
+    pub(crate) async fn open(config: &SecurityConfig) -> Self {
         Self::limited(config, Limits::default()).await
     }
 
-    pub async fn limited(config: &SecurityConfig, limits: Limits) -> Self {
+    pub(crate) async fn limited(config: &SecurityConfig, limits: Limits) -> Self {
         let (registry, shutdown) = (Registry::new(), Shutdown::new());
         // All of 127.0.0.0/8.
         let listener = TcpListener::bind("0.0.0.0:0").await.unwrap();
@@ -45,24 +44,24 @@ impl Port {
         Self { address, registry, shutdown }
     }
 
-    pub fn channel(&self, config: &SecurityConfig) -> Channel {
+    pub(crate) fn channel(&self, config: &SecurityConfig) -> Channel {
         channel(&self.address.to_string(), config)
     }
 
     /// Ends it.
-    pub fn close(&self) {
+    pub(crate) fn close(&self) {
         self.shutdown.trigger();
     }
 
     /// How much was refused for this reason.
-    pub fn refused(&self, reason: &str) -> u64 {
+    pub(crate) fn refused(&self, reason: &str) -> u64 {
         let families = self.registry.gather();
         let family = families.iter().find(|family| family.name() == "getup_grpc_refused_total").unwrap();
         let metric = family.get_metric().iter().find(|metric| metric.get_label()[0].value() == reason);
         metric.unwrap().get_counter().get_value() as u64
     }
 
-    pub fn connections(&self) -> u64 {
+    pub(crate) fn connections(&self) -> u64 {
         let families = self.registry.gather();
         let family = families.iter().find(|family| family.name() == "getup_grpc_connections").unwrap();
         family.get_metric()[0].get_gauge().get_value() as u64
@@ -83,22 +82,22 @@ fn behind_the_door(request: Request<()>) -> Result<Request<()>, Status> {
     }
 }
 
-pub fn channel(address: &str, config: &SecurityConfig) -> Channel {
+pub(crate) fn channel(address: &str, config: &SecurityConfig) -> Channel {
     Credentials::load(config).unwrap().channel(address, ChannelOptions::default()).unwrap()
 }
 
 /// A call of the health service.
-pub async fn call(channel: &Channel) -> Result<(), Status> {
+pub(crate) async fn call(channel: &Channel) -> Result<(), Status> {
     HealthClient::new(channel.clone()).check(HealthCheckRequest::default()).await.map(drop)
 }
 
-pub async fn refusal(channel: &Channel) -> (Code, String) {
+pub(crate) async fn refusal(channel: &Channel) -> (Code, String) {
     let status = call(channel).await.expect_err("the call should be refused");
     (status.code(), status.message().to_owned())
 }
 
 /// Tries again until it is so.
-pub async fn eventually(mut so: impl AsyncFnMut() -> bool) {
+pub(crate) async fn eventually(mut so: impl AsyncFnMut() -> bool) {
     let started = Instant::now();
     while !so().await {
         assert!(started.elapsed() < PATIENCE, "it does not come about");
@@ -107,34 +106,34 @@ pub async fn eventually(mut so: impl AsyncFnMut() -> bool) {
 }
 
 /// A folder with files of a test.
-pub struct Folder(TempDir);
+pub(crate) struct Folder(TempDir);
 
 impl Folder {
-    pub fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self(tempfile::tempdir().unwrap())
     }
 
-    pub fn path(&self) -> &Path {
+    pub(crate) fn path(&self) -> &Path {
         self.0.path()
     }
 
-    pub fn write(&self, name: &str, contents: impl AsRef<[u8]>) -> PathBuf {
+    pub(crate) fn write(&self, name: &str, contents: impl AsRef<[u8]>) -> PathBuf {
         let path = self.path().join(name);
         std::fs::write(&path, contents).unwrap();
         path
     }
 
-    pub fn text(&self, name: &str) -> String {
+    pub(crate) fn text(&self, name: &str) -> String {
         std::fs::read_to_string(self.path().join(name)).unwrap()
     }
 
     /// The configuration with a file of these tokens.
-    pub fn token(&self, tokens: &str) -> SecurityConfig {
+    pub(crate) fn token(&self, tokens: &str) -> SecurityConfig {
         SecurityConfig { token_file: self.write("token", tokens), ..SecurityConfig::default() }
     }
 
     /// The configuration with the files that `make_authority` writes.
-    pub fn tls(&self) -> SecurityConfig {
+    pub(crate) fn tls(&self) -> SecurityConfig {
         let [ca, certificate, key] = ["ca.pem", "peer.pem", "peer.key"].map(|name| self.path().join(name));
         SecurityConfig { ca, certificate, key, ..SecurityConfig::default() }
     }

@@ -1,10 +1,8 @@
 //! Ports that want a certificate.
 
-mod common;
-
 use std::sync::Arc;
 
-use common::{Folder, Port, call, channel, eventually, refusal};
+use crate::support::{Folder, Port, call, channel, eventually, refusal};
 use getup_transport::{SecurityConfig, generate_token, make_authority};
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, ServerName};

@@ -1,11 +1,8 @@
 //! The service as a process of its own, killed under load and on a slow disk: every acknowledged segment is there, and none
 //! twice.
 
-mod common;
-mod fixtures;
-
-use common::{PATIENCE, Writer, config, open};
-use fixtures::{segment, spec};
+use crate::common::{self, PATIENCE, Writer, config, open};
+use crate::fixtures::{segment, spec};
 use getup_replay::{MinibatchSource, RemoteOptions, RemoteSource, serve};
 use getup_telemetry::{Registry, Shutdown, Waits};
 use std::collections::HashMap;
@@ -46,7 +43,7 @@ fn start_with(dir: &Path, library: Option<&Path>) -> (Child, String) {
         command.env("LD_PRELOAD", library);
     }
     let mut child = command
-        .args(["--exact", "serves_until_it_is_killed", "--nocapture"])
+        .args(["--exact", "kill::serves_until_it_is_killed", "--nocapture"])
         .env(DIR, dir)
         .stdout(Stdio::piped())
         .spawn()

@@ -1,8 +1,6 @@
 //! Files of `[security]` that are not what they should be, and secrets that stay in theirs.
 
-mod common;
-
-use common::Folder;
+use crate::support::Folder;
 use getup_telemetry::Registry;
 use getup_transport::{
     ChannelOptions, Credentials, Limits, Metrics, SecurityConfig, Server, generate_token, make_authority,

@@ -1,10 +1,7 @@
 //! Looking at stores, mending, compacting and copying them.
 
-mod common;
-mod fixtures;
-
-use common::{Replay, config, eventually, open, options};
-use fixtures::{Ending, Part, segment, spec};
+use crate::common::{Replay, config, eventually, open, options};
+use crate::fixtures::{Ending, Part, segment, spec};
 use getup_proto::Segment;
 use getup_replay::{ReplayConfig, Sampler, Survey, compact, repair, segments, take_snapshot};
 use proptest::prelude::*;

@@ -1,10 +1,7 @@
 //! The append service over real connections: acknowledgements, refusals, back-pressure, draining.
 
-mod common;
-mod fixtures;
-
-use common::{Replay, Writer, config, eventually, hello, message, next, open, options};
-use fixtures::{Ending, Part, segment, spec};
+use crate::common::{Replay, Writer, config, eventually, hello, message, next, open, options};
+use crate::fixtures::{Ending, Part, segment, spec};
 use getup_proto::v1::append_request::Message;
 use getup_proto::{RunSpec, Segment, columns, v1};
 use getup_replay::{LocalSource, MinibatchSource, ReplayConfig, describe};

@@ -1,10 +1,7 @@
 //! Stores that the segments of the lowest priority leave first.
 
-mod common;
-mod fixtures;
-
-use common::{config, open, options};
-use fixtures::{Ending, Part, get_up_spec, segment, spec, value};
+use crate::common::{config, open, options};
+use crate::fixtures::{Ending, Part, get_up_spec, segment, spec, value};
 use getup_replay::{
     Item, ItemSelector, Minibatch, Remover, ReplayConfig, Sampler, Store, StoreError, Survey, compact,
     segments,

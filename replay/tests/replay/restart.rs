@@ -1,10 +1,7 @@
 //! A store that is closed and opened again goes on as if nothing had happened.
 
-mod common;
-mod fixtures;
-
-use common::{config, open, options};
-use fixtures::{Ending, Part, segment, spec};
+use crate::common::{config, open, options};
+use crate::fixtures::{Ending, Part, segment, spec};
 use getup_replay::{Minibatch, ReplayConfig, SampleOptions, Sampler, Store, SyncMode};
 use tempfile::TempDir;
 

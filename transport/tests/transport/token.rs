@@ -1,8 +1,6 @@
 //! Ports that want a token.
 
-mod common;
-
-use common::{Folder, Port, call, eventually, refusal};
+use crate::support::{Folder, Port, call, eventually, refusal};
 use getup_transport::{Credentials, SecurityConfig, generate_token};
 use http::HeaderMap;
 use http::header::AUTHORIZATION;
