@@ -53,13 +53,16 @@ fn main() -> anyhow::Result<()> {
     let task: Arc<dyn Task> = Arc::new(GetUp::new(&config, 1.0)?);
     let states = falls::draw(&config, STATES, 0)?.falls;
     let cases = cases(&*task);
+    // What needs a peer comes first: a missing one is said at once.
+    let mut forward = Vec::new();
+    for case in &cases {
+        forward.extend(case.evaluate()?);
+    }
     let mut rows = Vec::new();
     for case in &cases {
         rows.push(case.act(&task, &states)?);
     }
-    for case in &cases {
-        rows.extend(case.evaluate()?);
-    }
+    rows.extend(forward);
     report("actor", &rows)
 }
 
