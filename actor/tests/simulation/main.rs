@@ -13,9 +13,10 @@
 //! | `roles`, `trainer` | the three roles; the stubs |
 //! | `machine`, `network` | the power, the disk, the wires |
 //!
-//! Each schedule has a process of its own, whose random numbers all come from its seed: they do too where they ask the
-//! operating system. `GETUP_SIMULATION_SEED=N cargo test --release -p getup-actor --test simulation -- --nocapture` plays
-//! that of seed N aloud. `GETUP_TEST_FULL` plays five thousand.
+//! Each schedule, and the herd, has a process of its own, whose random numbers all come from its seed: they do too where
+//! they ask the operating system.
+//! `GETUP_SIMULATION_SEED=N cargo test --release -p getup-actor --test simulation -- --nocapture` plays the schedule of
+//! seed N aloud. `GETUP_TEST_FULL` plays five thousand.
 
 mod herd;
 mod ledger;
@@ -37,6 +38,8 @@ use tempfile::TempDir;
 const SEED: &str = "GETUP_SIMULATION_SEED";
 /// The seed of a process' own schedule.
 const SCHEDULE: &str = "GETUP_TEST_SCHEDULE";
+/// The test that plays it.
+const PLAYS: &str = "plays_its_schedule";
 /// An empty folder for its disks.
 const FOLDER: &str = "GETUP_TEST_FOLDER";
 /// Whether it tells every event.
@@ -68,20 +71,25 @@ ssize_t getrandom(void *bytes, size_t count, unsigned int flags) {
 /// The process of a schedule: without its variable there is nothing to prove here.
 #[test]
 fn plays_its_schedule() {
-    let Ok(seed) = std::env::var(SCHEDULE) else { return };
-    std::thread::spawn(|| {
-        std::thread::sleep(PATIENCE);
-        eprintln!("the schedule hangs: it was not played within {PATIENCE:?}");
-        std::process::abort();
-    });
-    let folder = PathBuf::from(std::env::var_os(FOLDER).unwrap());
-    match schedule::play(seed.parse().unwrap(), &folder, std::env::var_os(ALOUD).is_some()) {
+    let Some((seed, folder)) = own_process() else { return };
+    match schedule::play(seed, &folder, std::env::var_os(ALOUD).is_some()) {
         Ok(summary) => println!("\nplayed: {summary}"),
         Err(broken) => panic!("\nbroken: {broken}"),
     }
 }
 
-/// Starts processes of schedules.
+/// The seed and the folder that a [`Player`] started this process for, which then ends in time; `None` if none did.
+fn own_process() -> Option<(u64, PathBuf)> {
+    let seed = std::env::var(SCHEDULE).ok()?.parse().unwrap();
+    std::thread::spawn(|| {
+        std::thread::sleep(PATIENCE);
+        eprintln!("it hangs: it was not played within {PATIENCE:?}");
+        std::process::abort();
+    });
+    Some((seed, PathBuf::from(std::env::var_os(FOLDER).unwrap())))
+}
+
+/// Starts processes whose random numbers all come from a seed.
 struct Player {
     randomness: PathBuf,
     _folder: TempDir,
@@ -98,10 +106,11 @@ impl Player {
         Self { randomness, _folder: folder }
     }
 
-    fn command(&self, seed: u64, folder: &TempDir) -> Command {
+    /// A process of one of the tests here.
+    fn command(&self, test: &str, seed: u64, folder: &TempDir) -> Command {
         let mut command = Command::new(std::env::current_exe().unwrap());
         command
-            .args(["--exact", "plays_its_schedule", "--nocapture"])
+            .args(["--exact", test, "--nocapture"])
             .env(SCHEDULE, seed.to_string())
             .env(FOLDER, folder.path())
             .env("LD_PRELOAD", &self.randomness);
@@ -110,7 +119,7 @@ impl Player {
 
     fn play(&self, seed: u64) -> Result<String, String> {
         let folder = TempDir::new().unwrap();
-        let Output { status, stdout, stderr } = self.command(seed, &folder).output().unwrap();
+        let Output { status, stdout, stderr } = self.command(PLAYS, seed, &folder).output().unwrap();
         let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
         let (stdout, stderr) = (text(&stdout), text(&stderr));
         match stdout.lines().find(|line| line.starts_with("played: ")) {
@@ -133,7 +142,7 @@ fn what_is_promised_is_kept_in_every_schedule() {
     let player = Player::new();
     if let Ok(seed) = std::env::var(SEED) {
         let folder = TempDir::new().unwrap();
-        let status = player.command(seed.parse().unwrap(), &folder).env(ALOUD, "1").status().unwrap();
+        let status = player.command(PLAYS, seed.parse().unwrap(), &folder).env(ALOUD, "1").status().unwrap();
         assert!(status.success(), "the schedule of seed {seed} breaks a promise");
         return;
     }
@@ -176,8 +185,15 @@ fn a_seed_repeats_its_schedule_event_by_event() {
 
 #[test]
 fn actors_do_not_come_back_all_at_once_to_a_learner_that_was_away() {
+    const NAME: &str = "actors_do_not_come_back_all_at_once_to_a_learner_that_was_away";
     /// Within so long, no more than a quarter of them.
     const WINDOW: Duration = Duration::from_millis(50);
+    let Some((_, folder)) = own_process() else {
+        let folder = TempDir::new().unwrap();
+        let Output { status, stderr, .. } = Player::new().command(NAME, 1, &folder).output().unwrap();
+        assert!(status.success(), "{}", String::from_utf8_lossy(&stderr));
+        return;
+    };
     let most = |moments: &[Duration]| {
         let within = |first: &Duration| {
             moments.iter().filter(|moment| (*first..*first + WINDOW).contains(*moment)).count()
@@ -185,8 +201,9 @@ fn actors_do_not_come_back_all_at_once_to_a_learner_that_was_away() {
         moments.iter().map(within).max().unwrap_or(0)
     };
     for absence in [herd::Absence::Crash, herd::Absence::Hang] {
-        let folder = TempDir::new().unwrap();
-        let herd::Return { connections, mut heartbeats } = herd::play(folder.path(), absence);
+        let folder = folder.join(format!("{absence:?}"));
+        std::fs::create_dir(&folder).unwrap();
+        let herd::Return { connections, mut heartbeats } = herd::play(&folder, absence);
         if let herd::Absence::Crash = absence {
             assert_eq!(connections.len(), herd::ACTORS, "each connects again, once");
         }
