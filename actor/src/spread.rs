@@ -29,7 +29,7 @@ pub(crate) fn spread<W: SegmentWriter>(
     tasks: &mut JoinSet<Result<(), ActorError>>,
 ) {
     let freed = Arc::new(Notify::new());
-    let shares = Shares::new(queue.capacity().div_ceil(writers.len()));
+    let shares = Shares::new(queue.capacity().div_ceil(writers.len()), writers.len());
     let mut desks = Vec::new();
     for link in writers {
         let (segments, inbox) = mpsc::unbounded_channel();
@@ -124,22 +124,27 @@ async fn append<W: SegmentWriter>(mut to: Appending<W>) -> Result<(), ActorError
 struct Shares {
     /// Segments of a replay that may be unacknowledged.
     share: usize,
+    /// Segments that each replay was given.
+    given: Vec<u64>,
     /// The episode of each lane, and where its segments go.
     lanes: HashMap<u32, (u64, usize)>,
 }
 
 impl Shares {
-    fn new(share: usize) -> Self {
-        Self { share, lanes: HashMap::new() }
+    fn new(share: usize, replays: usize) -> Self {
+        Self { share, given: vec![0; replays], lanes: HashMap::new() }
     }
 
     /// The replay for a segment, given how many of each are unacknowledged: that of its episode, or where that has its
-    /// share, or for a new episode, the one with the fewest. None where all have their share.
+    /// share, or for a new episode, the one with the fewest; of several with as few (replays that keep up have none) the
+    /// one that was given least. None where all have their share.
     fn choose(&mut self, lane: u32, episode: u64, unacknowledged: &[usize]) -> Option<usize> {
         let has_room = |index: usize| unacknowledged[index] < self.share;
         let same = self.lanes.get(&lane).filter(|&&(of, index)| of == episode && has_room(index));
-        let fewest = || (0..unacknowledged.len()).min_by_key(|&index| unacknowledged[index]);
+        let load = |&index: &usize| (unacknowledged[index], self.given[index]);
+        let fewest = || (0..unacknowledged.len()).min_by_key(load);
         let chosen = same.map(|&(_, index)| index).or_else(fewest).filter(|&index| has_room(index))?;
+        self.given[chosen] += 1;
         self.lanes.insert(lane, (episode, chosen));
         Some(chosen)
     }
@@ -151,7 +156,7 @@ mod tests {
 
     #[test]
     fn an_episode_stays_where_it_began() {
-        let mut shares = Shares::new(4);
+        let mut shares = Shares::new(4, 2);
         assert_eq!(shares.choose(0, 1, &[0, 0]), Some(0));
         assert_eq!(shares.choose(1, 1, &[1, 0]), Some(1));
         assert_eq!(shares.choose(0, 1, &[3, 0]), Some(0), "though the other has fewer");
@@ -159,8 +164,22 @@ mod tests {
     }
 
     #[test]
+    fn replays_that_keep_up_get_as_much_each() {
+        let mut shares = Shares::new(8, 3);
+        for episode in 0..100 {
+            for lane in 0..16 {
+                for _segment in 0..4 {
+                    shares.choose(lane, episode, &[0; 3]).expect("all have room");
+                }
+            }
+        }
+        let most = shares.given.iter().max().unwrap();
+        assert!(shares.given.iter().all(|given| most - given <= 4), "{:?}", shares.given);
+    }
+
+    #[test]
     fn one_that_is_away_gets_its_share_and_no_more() {
-        let mut shares = Shares::new(2);
+        let mut shares = Shares::new(2, 2);
         let mut unacknowledged = [0, 0];
         let mut given = [0, 0];
         for step in 0..40 {
