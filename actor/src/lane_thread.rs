@@ -45,8 +45,15 @@ pub(crate) struct EvaluationDesk {
 impl LaneThread {
     /// Runs until it is stopped, or cannot go on. Blocks: it is to have a thread of its own.
     pub(crate) fn run(mut self, runtime: &Handle) -> Result<(), ActorError> {
-        let mut group: Option<LaneGroup> = None;
         let mut pending = VecDeque::new();
+        let ended = self.play(runtime, &mut pending);
+        self.queue.finish_with(pending);
+        ended
+    }
+
+    /// What of its segments did not fit into the queue at the end is left in `pending`.
+    fn play(&mut self, runtime: &Handle, pending: &mut VecDeque<Segment>) -> Result<(), ActorError> {
+        let mut group: Option<LaneGroup> = None;
         let mut segments = Vec::new();
         let mut lease = None;
         let mut waiting: Option<WaitGuard> = None;
@@ -57,7 +64,7 @@ impl LaneThread {
                 self.evaluate(&lease)?;
                 continue;
             }
-            let obstacle = self.obstacle(group.as_ref(), &mut pending);
+            let obstacle = self.obstacle(group.as_ref(), pending);
             match (obstacle, &mut group) {
                 (None, Some(group)) => {
                     waiting = None;

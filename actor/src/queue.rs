@@ -38,11 +38,20 @@ impl QueueInput {
             && let Some(segment) = pending.pop_front()
         {
             permit.forget();
-            self.metrics.segments.inc();
-            self.metrics.unacknowledged_segments.inc();
-            // Without a receiver the actor is about to end, and the segment is among those nobody acknowledges.
-            let _ = self.sender.send(segment);
+            self.put(segment);
         }
+    }
+
+    /// Moves the last segments into the queue, whether they fit or not: no others follow.
+    pub fn finish_with(self, pending: VecDeque<Segment>) {
+        pending.into_iter().for_each(|segment| self.put(segment));
+    }
+
+    fn put(&self, segment: Segment) {
+        self.metrics.segments.inc();
+        self.metrics.unacknowledged_segments.inc();
+        // Without a receiver the actor is about to end, and the segment is among those nobody acknowledges.
+        let _ = self.sender.send(segment);
     }
 
     /// Returns when a segment would fit.

@@ -34,12 +34,8 @@ impl Actor {
         Self { shutdown, registry, waits, running }
     }
 
-    /// The value of a metric without labels.
     fn metric(&self, name: &str) -> f64 {
-        let families = self.registry.gather();
-        let family = families.iter().find(|family| family.name() == name).expect(name);
-        let metric = &family.get_metric()[0];
-        metric.get_counter().get_value() + metric.get_gauge().get_value()
+        value(&self.registry, name)
     }
 
     fn waits_for(&self, reason: &str) -> bool {
@@ -52,6 +48,14 @@ impl Actor {
         self.running.await.unwrap().unwrap();
         start.elapsed()
     }
+}
+
+/// The value of a metric without labels.
+fn value(registry: &Registry, name: &str) -> f64 {
+    let families = registry.gather();
+    let family = families.iter().find(|family| family.name() == name).expect(name);
+    let metric = &family.get_metric()[0];
+    metric.get_counter().get_value() + metric.get_gauge().get_value()
 }
 
 fn services(folder: &Path) -> (ActorSetup, Store, Server, Broadcast, Server) {
@@ -149,7 +153,10 @@ async fn a_full_queue_stops_the_lanes_with_a_reason_and_not_the_evaluations() {
     broadcast.with(|state| state.lease = Some(lease));
     eventually("a report", || broadcast.with(|state| !state.reports.is_empty())).await;
     assert_eq!(actor.metric("getup_actor_env_steps_total"), steps);
+    let registry = actor.registry.clone();
     assert!(actor.end().await < Duration::from_secs(4), "the drain is bounded");
+    // The segment that did not fit stopped the lanes: it is among those that are said to be lost.
+    assert!(value(&registry, "getup_actor_unacknowledged_segments") > 10.0);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
