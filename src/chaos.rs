@@ -1,10 +1,12 @@
 //! `getup chaos`: a plan of faults against a running cluster, and whether it heals.
 
+use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
+use getup_telemetry::Shutdown;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -14,6 +16,8 @@ use serde_json::Value;
 const TICK: Duration = Duration::from_millis(500);
 /// Between the faults of a soak.
 const PAUSE: Duration = Duration::from_secs(20);
+/// Seconds that a fault may hold, or its end may take.
+const LONGEST: Duration = Duration::from_secs(24 * 3600);
 /// An actor that was heard from more recently takes part.
 const HEARD_SECONDS: f64 = 5.0;
 
@@ -24,7 +28,8 @@ const HEARD_SECONDS: f64 = 5.0;
 /// (seconds between the two) and `within` (seconds in which the cluster must be well again). It is well when the learner
 /// makes updates, the replay stores env steps, and as many actors are heard as before; with `trains = true` it must be so
 /// while the fault holds, too. And it must never have lost anything: what the replays hold, the curriculum's stage, and
-/// the policies' versions only grow. A fault whose command `needs` fails is skipped.
+/// the policies' versions only grow. A fault whose command `needs` fails is skipped. What was injected is healed also
+/// where `inject` failed halfway, and after Ctrl-C, which ends the plan; after a second one it is not.
 ///
 /// Commands find this program as $GETUP. deploy/chaos.toml is the plan for a cluster of docker compose.
 #[derive(clap::Args)]
@@ -59,6 +64,9 @@ struct Plan {
     prelude: String,
     observe: String,
     fault: Vec<Fault>,
+    /// Somebody asked for the end.
+    #[serde(skip)]
+    interrupted: Shutdown,
 }
 
 #[derive(Deserialize)]
@@ -99,6 +107,13 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let text =
         std::fs::read_to_string(&arguments.plan).with_context(|| format!("cannot read the plan {shown}"))?;
     let plan: Plan = toml::from_str(&text).with_context(|| format!("{shown} is no plan"))?;
+    for Fault { name, hold, within, .. } in &plan.fault {
+        let longest = LONGEST.as_secs_f64();
+        ensure!(
+            [hold, within].into_iter().all(|seconds| (0.0..=longest).contains(seconds)),
+            "{shown}: fault {name:?}: hold = {hold}, within = {within}: seconds, from 0 to {longest}"
+        );
+    }
     let chosen = |fault: &&Fault| {
         arguments.only.is_empty() || arguments.only.iter().any(|text| fault.name.contains(text.as_str()))
     };
@@ -116,8 +131,13 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         "this breaks the cluster, on purpose, in {} ways: say --yes to do it, --list to see how",
         faults.len()
     );
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+    runtime.block_on(async { plan.interrupted.on_signals() }).context("cannot watch for signals")?;
     let mut failed = 0;
-    for fault in sequence(faults, arguments.soak, arguments.seed) {
+    for fault in plan.sequence(faults, arguments.soak, arguments.seed) {
+        if plan.interrupted.is_triggered() {
+            bail!("interrupted: what was injected is healed");
+        }
         let outcome = plan.try_fault(fault);
         failed += usize::from(!outcome.passed && !outcome.skipped);
         if arguments.json {
@@ -139,18 +159,31 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     Ok(())
 }
 
-/// Every fault once; or for some minutes one at random after another, with a pause before each.
-fn sequence(faults: Vec<&Fault>, soak: Option<f64>, seed: u64) -> Box<dyn Iterator<Item = &Fault> + '_> {
-    let Some(minutes) = soak else { return Box::new(faults.into_iter()) };
-    let until = Instant::now() + Duration::from_secs_f64(60.0 * minutes.clamp(0.0, 1e6));
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    Box::new(std::iter::from_fn(move || {
-        std::thread::sleep(PAUSE);
-        (Instant::now() < until).then(|| faults[rng.random_range(0..faults.len())])
-    }))
-}
-
 impl Plan {
+    /// Every fault once; or for some minutes one at random after another, with a pause before each.
+    fn sequence<'a>(
+        &'a self,
+        faults: Vec<&'a Fault>,
+        soak: Option<f64>,
+        seed: u64,
+    ) -> Box<dyn Iterator<Item = &'a Fault> + 'a> {
+        let Some(minutes) = soak else { return Box::new(faults.into_iter()) };
+        let until = Instant::now() + Duration::from_secs_f64(60.0 * minutes.clamp(0.0, 1e6));
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        Box::new(std::iter::from_fn(move || {
+            self.pause(PAUSE);
+            (Instant::now() < until).then(|| faults[rng.random_range(0..faults.len())])
+        }))
+    }
+
+    /// Waits, until somebody asks for the end.
+    fn pause(&self, time: Duration) {
+        let until = Instant::now() + time;
+        while !self.interrupted.is_triggered() && Instant::now() < until {
+            std::thread::sleep(TICK.min(until.saturating_duration_since(Instant::now())));
+        }
+    }
+
     fn try_fault<'a>(&self, fault: &'a Fault) -> Outcome<'a> {
         if !fault.needs.is_empty()
             && let Err(error) = self.shell(&fault.needs)
@@ -183,10 +216,14 @@ impl Plan {
         // Whatever was broken before must be well, or this fault would be blamed for it.
         let patience = Duration::from_secs(60);
         let before = self.wait_until_well(None, Instant::now(), patience).context("before the fault")?.0;
-        self.shell(&fault.inject).context("inject")?;
+        if let Err(error) = self.shell(&fault.inject) {
+            // Some of it may be there: each command of the heal, whether those before it have found something or not.
+            let _ = self.shell(&format!("set +e\n{}", fault.heal));
+            return Err(error.context("inject"));
+        }
         let (injected, hold) = (Instant::now(), Duration::from_secs_f64(fault.hold));
         let during = fault.trains.then(|| self.wait_until_well(Some(&before), injected, hold));
-        std::thread::sleep(hold.saturating_sub(injected.elapsed()));
+        self.pause(hold.saturating_sub(injected.elapsed()));
         if !fault.heal.is_empty() {
             self.shell(&fault.heal).context("heal")?;
         }
@@ -206,6 +243,7 @@ impl Plan {
         let mut first: Option<Health> = None;
         let mut why = "nobody answers".to_owned();
         while since.elapsed() < patience {
+            ensure!(!self.interrupted.is_triggered(), "interrupted");
             match self.observe() {
                 Ok(now) => {
                     if let Some(before) = before {
@@ -235,10 +273,12 @@ impl Plan {
         Health::of(&status)
     }
 
+    /// Runs a command in a process group of its own: Ctrl-C ends the plan, not half of a fault.
     fn shell(&self, command: &str) -> Result<String> {
         let script = format!("{}\n{command}", self.prelude);
         let getup = std::env::current_exe().context("this program's file is not known")?;
         let mut bash = Command::new("bash");
+        bash.process_group(0);
         let output = bash.args(["-ec", &script]).env("GETUP", getup).output().context("cannot start bash")?;
         let stderr = String::from_utf8_lossy(&output.stderr);
         ensure!(output.status.success(), "{} ({})", stderr.trim(), output.status);
