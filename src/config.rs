@@ -31,7 +31,7 @@ pub(crate) struct Config {
     pub(crate) preset: String,
     /// The run's name; roles of different runs refuse each other.
     pub(crate) run: String,
-    /// Every random draw comes from it.
+    /// Every random draw comes from it; those of an actor that is a process of its own, from it and the id of its start.
     pub(crate) seed: u64,
     /// Env steps of the whole run; 0 lets the curriculum end it.
     pub(crate) steps: u64,
@@ -301,8 +301,8 @@ impl Config {
 
     /// How an episode's β̂ is drawn around β^i.
     pub(crate) fn beta_draw(&self) -> BetaDraw {
-        let CurriculumConfig { beta_std, beta_floor, beta_start, .. } = self.curriculum;
-        BetaDraw { std: beta_std, floor: beta_floor, ceiling: beta_start }
+        let CurriculumConfig { beta_std, beta_floor, .. } = self.curriculum;
+        BetaDraw { std: beta_std, floor: beta_floor, ceiling: self.control_limit() }
     }
 
     /// The clamp of the actuators: β̂ above 1 widens it.
@@ -376,6 +376,23 @@ mod tests {
         let config = config.unwrap();
         assert_eq!((config.sac.batch, config.seed, config.run.as_str()), (32, 7, "arms"));
         assert_eq!((config.sac.hidden, config.sac.target_entropy.nats(21)), (vec![8, 8], -4.0));
+    }
+
+    #[test]
+    fn what_the_compose_files_are_told_by_the_environment_is_no_unknown_setting() {
+        let files = [include_str!("../deploy/compose.yaml"), include_str!("../deploy/compose.bench.yaml")];
+        let names = files.iter().flat_map(|file| file.split("${").skip(1)).map(|rest| {
+            let end = rest.find(|char: char| !char.is_ascii_uppercase() && char != '_');
+            &rest[..end.unwrap_or(rest.len())]
+        });
+        let names: std::collections::BTreeSet<&str> = names.collect();
+        assert!(names.contains("GETUP_GRAFANA_PORT") && names.contains("GETUP_ACTOR_CPUS"), "{names:?}");
+        for name in names {
+            load(&[], &[(name, "1")]).unwrap();
+        }
+        // A setting of such a table is one still.
+        assert_eq!(load(&[], &[("GETUP_ACTOR__LANES", "3")]).unwrap().actor.lanes, 3);
+        assert!(load(&[], &[("GETUP_ACTOR__LANS", "3")]).is_err());
     }
 
     #[test]

@@ -67,9 +67,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         "--episodes {}: from 1 to 1000000",
         arguments.episodes
     );
-    let Actor { policy, beta, character } =
-        Actor::load(&arguments.model, arguments.beta, arguments.character)?;
-    let task = TaskConfig { character, ..TaskConfig::default() };
+    let Actor { policy, beta, task } = Actor::load(&arguments.model, arguments.beta, arguments.character)?;
     let mut evaluator = Evaluator::new(&task, beta.max(1.0), LANES.min(arguments.episodes))?;
     let seeds = unseen_falls(arguments.seed, arguments.episodes);
     let bar = progress_bar(arguments.episodes as u64, "falls");
@@ -86,7 +84,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         None => evaluator.evaluate(&policy, beta, &seeds, progress)?,
     };
     bar.finish_and_clear();
-    let report = summarize(&episodes, beta, character, arguments.seed);
+    let report = summarize(&episodes, beta, task.character, arguments.seed);
     if arguments.json {
         println!("{}", serde_json::to_string(&report).context("the report is not expressible as JSON")?);
     } else {
@@ -98,11 +96,11 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     Ok(())
 }
 
-/// A model with what it is asked to act under: its own character and β, unless others are given.
+/// A model with what it is asked to act under: its own character and β, unless others are given, and its own physics rate.
 pub(crate) struct Actor {
     pub(crate) policy: Policy,
     pub(crate) beta: f64,
-    pub(crate) character: Character,
+    pub(crate) task: TaskConfig,
 }
 
 impl Actor {
@@ -116,7 +114,13 @@ impl Actor {
             (None, Some(name)) => name.parse().with_context(|| "the model's metadata")?,
             (None, None) => Character::Standard,
         };
-        Ok(Self { policy, beta, character })
+        let mut task = TaskConfig { character, ..TaskConfig::default() };
+        if let Some(physics_hz) = policy.metadata.get("physics_hz") {
+            let unusable = || format!("the model's metadata: physics_hz = {physics_hz:?}");
+            task.physics_hz = physics_hz.parse().with_context(unusable)?;
+            task.validate().with_context(unusable)?;
+        }
+        Ok(Self { policy, beta, task })
     }
 }
 

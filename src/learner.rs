@@ -59,12 +59,9 @@ async fn serve(
     device: Device,
     from: Option<&Path>,
 ) -> Result<()> {
-    check_preset(config, &folder)?;
-    let beginning = from.map(load_beginning).transpose()?;
-    let start = match &beginning {
-        Some(beginning) if !folder.has_checkpoint() => Start::From(beginning),
-        _ => Start::Newest,
-    };
+    check_run(config, &folder)?;
+    let beginning = from.filter(|_| !folder.has_checkpoint()).map(load_beginning).transpose()?;
+    let start = beginning.as_ref().map_or(Start::Newest, Start::From);
     folder.create()?;
     let (hub, incarnation) = make_hub(config, role, &folder)?;
     let address = &config.network.learner;
@@ -97,6 +94,7 @@ async fn serve(
         Err(TrainError::Loss(loss)) => {
             // Actors go on by the last good policy, and whoever looks sees why training does not: until it is restarted.
             tracing::error!("training stopped: {loss}");
+            let _stopped = role.waits.begin("learner", format!("training stopped: {loss}"));
             role.shutdown.wait().await;
         }
         Ok(Ending::Shutdown) | Err(_) => {}
@@ -110,16 +108,24 @@ async fn serve(
     Ok(result.map(drop)?)
 }
 
-/// A run goes on under the preset it began with.
-fn check_preset(config: &Config, folder: &RunFolder) -> Result<()> {
+/// A run goes on under the preset and the seed that it began with, whatever layer they come from now.
+pub(crate) fn check_run(config: &Config, folder: &RunFolder) -> Result<()> {
     let Ok(text) = std::fs::read_to_string(folder.config()) else { return Ok(()) };
     let table: toml::Table = text.parse().with_context(|| folder.config().display().to_string())?;
     let preset = table.get("preset").and_then(|value| value.as_str()).unwrap_or(&config.preset);
+    let root = folder.root().display();
     ensure!(
         preset == config.preset,
-        "the run in {} has preset {preset}, not {}: leave --preset as it was, or choose another --run",
-        folder.root().display(),
+        "the run in {root} has preset {preset}, not {}: leave --preset as it was, or choose another --run",
         config.preset
+    );
+    let seed = table.get("seed").and_then(|value| value.as_integer()).map(|seed| seed as u64);
+    let seed = seed.unwrap_or(Config::default().seed);
+    ensure!(
+        seed == config.seed,
+        "the run in {root} has seed {seed}, not {}: its evaluations are drawn from it; leave the seed as it was, or \
+         choose another --run",
+        config.seed
     );
     Ok(())
 }
@@ -163,6 +169,7 @@ pub(crate) fn make_trainer(
     let trainer = TrainerConfig {
         run: config.run.clone(),
         character: config.task.character.to_string(),
+        physics_hz: config.task.physics_hz,
         seed: config.seed,
         replays: config.network.replays().len(),
         steps: (config.steps > 0).then_some(config.steps),

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail, ensure};
 use getup_actor::evaluate::{EvaluatedEpisode, Evaluator};
 use getup_sim::picture::Painter;
-use getup_sim::{Character, TaskConfig, UP_HEIGHT};
+use getup_sim::{Character, UP_HEIGHT};
 
 use crate::evaluate::{Actor, unseen_falls};
 use crate::output::write_file;
@@ -59,7 +59,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let last = last_step(&episode, arguments.seconds, poses.len())?;
 
     let (width, count) = (height * 3 / 4, frames.max(2) - 1);
-    let mut painter = Painter::new(actor.character, width, height)?;
+    let mut painter = Painter::new(actor.task.character, width, height)?;
     let azimuth = painter.heading(&poses[last])? + VIEW;
     let mut strip = vec![0; frames * width * height * 3];
     let mut seconds = Vec::new();
@@ -89,8 +89,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
 
 /// One episode, and its poses from the fallen one on.
 fn play(actor: &Actor, seed: u64) -> Result<(EvaluatedEpisode, Vec<Vec<f64>>)> {
-    let task = TaskConfig { character: actor.character, ..TaskConfig::default() };
-    let mut evaluator = Evaluator::new(&task, actor.beta.max(1.0), 1)?;
+    let mut evaluator = Evaluator::new(&actor.task, actor.beta.max(1.0), 1)?;
     let seeds = unseen_falls(seed, 1);
     let (mut episodes, mut file) =
         evaluator.record(&actor.policy, actor.beta, &seeds, |_| ControlFlow::Continue(()))?;

@@ -18,7 +18,7 @@ use getup_replay::{LocalSource, ReplayMetrics, Store};
 use getup_telemetry::LogFormat;
 
 use crate::config::{Config, ConfigArgs};
-use crate::learner::{load_beginning, make_hub, make_trainer, sample_options};
+use crate::learner::{check_run, load_beginning, make_hub, make_trainer, sample_options};
 use crate::links::{HubLink, StoreWriter};
 use crate::role::Role;
 
@@ -92,8 +92,7 @@ fn prepare(arguments: &mut Args) -> Result<(Config, RunFolder)> {
         return prepare_resumed(arguments);
     }
     let mut config = arguments.config.load()?;
-    let path =
-        arguments.run.clone().unwrap_or_else(|| format!("runs/{}-{}", config.preset, config.seed).into());
+    let path = arguments.run.clone().unwrap_or_else(|| default_folder(&config));
     if path.join("config.toml").exists() {
         let shown = path.display();
         bail!(
@@ -104,25 +103,27 @@ fn prepare(arguments: &mut Args) -> Result<(Config, RunFolder)> {
     Ok((config, RunFolder::new(path)))
 }
 
+/// Where a run of this preset and seed is, unless `--run` says it.
+fn default_folder(config: &Config) -> PathBuf {
+    format!("runs/{}-{}", config.preset, config.seed).into()
+}
+
 fn prepare_resumed(arguments: &mut Args) -> Result<(Config, RunFolder)> {
-    let preset = arguments.config.preset.take();
-    let path = match (&arguments.run, &preset) {
-        (Some(path), _) => path.clone(),
-        (None, preset) => {
-            let seed = arguments.seed.unwrap_or(0);
-            format!("runs/{}-{seed}", preset.as_deref().unwrap_or("laptop")).into()
-        }
+    ensure!(
+        arguments.config.config.is_none(),
+        "--resume starts from the run's own config.toml, not from --config"
+    );
+    let path = match &arguments.run {
+        Some(path) => path.clone(),
+        None => default_folder(&arguments.config.load()?),
     };
+    let preset = arguments.config.preset.take();
     let folder = RunFolder::new(path);
     let file = folder.config();
     ensure!(
         file.exists(),
         "--resume: there is no run in {}: name its folder with --run",
         folder.root().display()
-    );
-    ensure!(
-        arguments.config.config.is_none(),
-        "--resume starts from the run's own config.toml, not from --config"
     );
     arguments.config.config = Some(file);
     let config = arguments.config.load()?;
@@ -135,15 +136,7 @@ fn prepare_resumed(arguments: &mut Args) -> Result<(Config, RunFolder)> {
             config.preset
         );
     }
-    let of_the_run =
-        ConfigArgs { config: arguments.config.config.clone(), ..ConfigArgs::default() }.load()?;
-    ensure!(
-        config.seed == of_the_run.seed,
-        "--resume: the run in {} has seed {}, not {}: its evaluations are drawn from it; train a new run",
-        folder.root().display(),
-        of_the_run.seed,
-        config.seed
-    );
+    check_run(&config, &folder).context("--resume")?;
     Ok((config, folder))
 }
 
@@ -176,7 +169,7 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_
     role.ready.set();
     let bar = progress::Progress::start(role, config, Arc::clone(&hub));
 
-    let identity = Identity::new(&config.actor.name, config.seed);
+    let identity = Identity::of_start(&config.actor.name, config.seed, incarnation);
     let writer = StoreWriter::new(store, &identity, role.shutdown.clone());
     let setup = crate::actor::setup(config, role, identity, folder.root().join("diverged"))?;
     let link = HubLink { hub: Arc::clone(&hub), spec, name: config.actor.name.clone() };

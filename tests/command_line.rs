@@ -67,6 +67,15 @@ fn a_run_is_interrupted_resumed_and_ended_by_its_steps() {
         let error = fail(refused.args(arguments).current_dir(folder.path()));
         assert!(error.contains(expected), "{error}");
     }
+    // Also where the seed comes from the environment, and for the learner's process.
+    for role in [["train", "--resume"], ["learner", "--preset=smoke"]] {
+        let mut refused = getup(&[role[0], role[1], "--run", "run"]);
+        let error = fail(refused.env("GETUP_SEED", "7").current_dir(folder.path()));
+        assert!(error.contains("has seed 0, not 7"), "{error}");
+    }
+    let mut elsewhere = getup(&["train", "--resume", "--set", "seed=4"]);
+    let error = fail(elsewhere.env("GETUP_PRESET", "smoke").current_dir(folder.path()));
+    assert!(error.contains("no run in runs/smoke-4"), "{error}");
     // What was refused changed nothing. Past its steps already: it saves and ends.
     let mut resume = getup(&["train", "--run", "run", "--resume", "--steps", "10"]);
     assert!(succeed(resume.current_dir(folder.path())).contains("Done:"));
@@ -120,7 +129,7 @@ fn a_run_goes_on_without_its_replay_and_another_begins_with_its_networks() {
 
     for (file, expected) in [
         (checkpoint.to_str().unwrap(), "the configured networks have"),
-        ("first/models/last.safetensors", "hidden: [8, 8] } }: begin with another model, or set [sac]"),
+        ("first/models/last.safetensors", "hidden: [8, 8] } }: take another model, or set [sac]"),
         ("first/config.toml", "the checkpoint first/config.toml is not usable"),
     ] {
         let from = ["--run", "third", "--from", file];
@@ -311,4 +320,38 @@ fn the_doctor_names_every_check_and_finds_a_taken_port() {
         assert_eq!(check["good"], check["name"] != "ports", "{check}");
     }
     assert!(checks.len() >= 7, "{checks:?}");
+}
+
+/// A plan of one fault, against what answers as a cluster that gets on with its work.
+fn plan(folder: &Path, fault: &str) -> Command {
+    let observe = r#"
+n=$(( $(cat n 2>/dev/null || echo 0) + 1 )); echo $n >n
+echo "{\"replay\": {\"store\": \"a\", \"transitions\": $n, \"env_steps\": $n}, \"learner\": {\"version\": \"1.$n\",
+    \"updates\": $n, \"stage\": 0, \"state\": \"training\", \"actors\": [{\"silent_seconds\": 0.1}]}}"
+"#;
+    let text = format!("observe = '''{observe}'''\n[[fault]]\nname = \"it breaks\"\n{fault}");
+    std::fs::write(folder.join("plan.toml"), text).unwrap();
+    let mut command = getup(&["chaos", "--plan", "plan.toml", "--yes"]);
+    command.current_dir(folder);
+    command
+}
+
+#[test]
+fn a_fault_is_healed_after_half_an_injection_and_after_an_interruption() {
+    let folder = tempfile::tempdir().unwrap();
+    let broken = folder.path().join("broken");
+    let half = "inject = 'touch broken; false'\nheal = 'rm was-not-there; rm broken'";
+    let said = fail(&mut plan(folder.path(), half));
+    assert!(said.contains("did not come through 1"), "{said}");
+    assert!(!broken.exists());
+
+    let held = "inject = 'touch broken'\nheal = 'rm broken'\nhold = 600";
+    let mut chaos = Process::start("chaos", folder.path(), &mut plan(folder.path(), held));
+    wait_for("the fault", Duration::from_secs(20), || broken.exists().then_some(()));
+    chaos.signal("INT");
+    assert!(!chaos.wait(Duration::from_secs(20)).success());
+    assert!(!broken.exists(), "{}", chaos.log());
+
+    let refused = fail(&mut plan(folder.path(), "inject = 'true'\nhold = -1.0"));
+    assert!(refused.contains("hold = -1"), "{refused}");
 }

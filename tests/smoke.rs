@@ -9,6 +9,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use common::{Cluster, getup, metric, scrape, succeed, wait_for};
+use getup_policy::Policy;
 use serde_json::Value;
 
 const LIMIT: Duration = Duration::from_secs(60);
@@ -147,6 +148,16 @@ fn check_run_folder(folder: &Path) {
     }
     let steps: Vec<u64> = evaluations.iter().map(|line| line["env_steps"].as_u64().unwrap()).collect();
     assert!(steps.is_sorted(), "{steps:?}");
+    let mut stages = 0;
+    for model in std::fs::read_dir(folder.join("models")).unwrap().map(|entry| entry.unwrap().path()) {
+        let said = Policy::load(&model).unwrap().metadata;
+        assert_eq!(said["physics_hz"], "200");
+        if let Some(stage) = model.file_stem().unwrap().to_str().unwrap().strip_prefix("stage-") {
+            assert_eq!(said["stage"], stage);
+            stages += 1;
+        }
+    }
+    assert!(stages > 0, "no stage was passed");
     let best = folder.join("models/best.safetensors");
     let report = succeed(
         getup(&["evaluate", best.to_str().unwrap(), "--episodes", "2", "--json"]).current_dir(folder),

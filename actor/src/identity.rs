@@ -16,9 +16,15 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// An actor that starts now, under a new writer id.
+    /// An actor that starts now as one of several, which know nothing of each other: under a writer id that the operating
+    /// system draws.
     pub fn new(name: &str, run_seed: u64) -> Self {
         Self { name: name.to_owned(), run_seed, writer: rand::random() }
+    }
+
+    /// The only actor of a run, of the `start`th start of that run: the run's seed decides all its draws.
+    pub fn of_start(name: &str, run_seed: u64, start: u64) -> Self {
+        Self { name: name.to_owned(), run_seed, writer: start }
     }
 
     /// The same actor as the `index`th of several replays knows it: two addresses of one replay are two writers to it.

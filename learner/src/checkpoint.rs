@@ -16,7 +16,7 @@ use tch::Tensor;
 use crate::adam::ScalarAdam;
 use crate::curriculum::Curriculum;
 use crate::parameters::to_vec;
-use crate::run_folder::{FolderError, write_atomically};
+use crate::run_folder::{FolderError, remove_unfinished, write_atomically};
 use crate::sac::{ActorMismatch, Sac};
 use crate::statistics::RunningStatistics;
 
@@ -123,6 +123,9 @@ struct Scalars {
     log_temperature: f64,
     temperature_adam: ScalarAdam,
     statistics: RunningStatistics,
+    /// Whether the networks read observations that the statistics normalise; unknown of a file that does not say it.
+    #[serde(default)]
+    normalizes: Option<bool>,
     rng: ChaCha8Rng,
 }
 
@@ -162,6 +165,7 @@ impl Checkpoint {
             log_temperature: sac.log_temperature,
             temperature_adam: sac.temperature_adam.clone(),
             statistics: sac.statistics.clone(),
+            normalizes: Some(sac.config.normalize_observations),
             rng: sac.rng.clone(),
         };
         Self { tensors, scalars, curriculum: curriculum.clone(), progress: progress.clone() }
@@ -205,6 +209,9 @@ impl Checkpoint {
                 return Err(CheckpointError::Shape { name: (*name).into(), found, wanted });
             }
         }
+        if let Some(normalizes) = self.scalars.normalizes {
+            sac.check_normalizes("checkpoint", normalizes)?;
+        }
         let _guard = tch::no_grad_guard();
         for (name, tensor) in buffers {
             tensor.shallow_clone().copy_(&Tensor::from_slice(&self.tensors[name]));
@@ -227,6 +234,7 @@ impl Checkpoint {
 
     /// Writes the checkpoint into `folder` and removes all but the newest `kept`.
     pub fn save(&self, folder: &Path, kept: usize) -> Result<PathBuf, CheckpointError> {
+        remove_unfinished(folder)?;
         let path = folder.join(self.file_name());
         write_atomically(&path, &self.to_bytes())?;
         for old in list(folder)?.into_iter().rev().skip(kept) {
@@ -450,5 +458,11 @@ mod tests {
         let mut other = Sac::new(&shape, &wider, 0, Device::Cpu, 1);
         let error = Checkpoint::newest(folder.path()).unwrap().unwrap().restore(&mut other).unwrap_err();
         assert!(matches!(error, CheckpointError::Shape { .. }), "{error}");
+        // What changes no length changes what the networks read.
+        let normalized = SacConfig { normalize_observations: true, ..config };
+        let mut other = Sac::new(&shape, &normalized, 0, Device::Cpu, 1);
+        let error = Checkpoint::newest(folder.path()).unwrap().unwrap().restore(&mut other).unwrap_err();
+        let said = "the checkpoint's observations: as they are; the configuration's: normalised";
+        assert!(error.to_string().starts_with(said), "{error}");
     }
 }

@@ -48,7 +48,8 @@ pub struct Evaluation {
 /// What the training thread tells of itself.
 #[derive(Clone, Debug, Default)]
 pub struct Standing {
-    /// "waiting", "filling" (the replay, before the updates of a trained actor go on), "training", "finished".
+    /// "waiting", "filling" (the replay, before the updates of a trained actor go on), "training", "finished", "stopped" (by an
+    /// update that failed).
     pub state: &'static str,
     /// Env steps of the run.
     pub env_steps: u64,

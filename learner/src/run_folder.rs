@@ -18,6 +18,9 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
+/// The extension of a file that is being written, or whose writing was cut short.
+const UNFINISHED: &str = "unfinished";
+
 /// A run's folder cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot {action} {path}: {source}")]
@@ -83,9 +86,12 @@ impl RunFolder {
         self.root.join("timings.jsonl")
     }
 
-    /// Whether there is something to resume.
+    /// Whether there is something to resume: a checkpoint, not only one whose writing was cut short.
     pub fn has_checkpoint(&self) -> bool {
-        fs::read_dir(self.checkpoints()).is_ok_and(|mut files| files.next().is_some())
+        let finished = |entry: io::Result<fs::DirEntry>| {
+            entry.is_ok_and(|entry| entry.path().extension().is_some_and(|extension| extension != UNFINISHED))
+        };
+        fs::read_dir(self.checkpoints()).is_ok_and(|mut files| files.any(finished))
     }
 
     /// Makes the folder and its parts.
@@ -121,9 +127,21 @@ pub fn append_line(path: &Path, line: &impl Serialize) -> Result<(), FolderError
     file.write_all(text.as_bytes()).map_err(fault("append to", path))
 }
 
-/// Writes a file under a temporary name, syncs it, and renames it: a reader sees the old one or the new one.
+/// Removes what a process that was killed had not finished writing to a folder. Nobody may be writing there.
+pub(crate) fn remove_unfinished(folder: &Path) -> Result<(), FolderError> {
+    for entry in fs::read_dir(folder).map_err(fault("read", folder))? {
+        let path = entry.map_err(fault("read", folder))?.path();
+        if path.extension().is_some_and(|extension| extension == UNFINISHED) {
+            fs::remove_file(&path).map_err(fault("remove", &path))?;
+        }
+    }
+    Ok(())
+}
+
+/// Writes a file under a temporary name, syncs it, and renames it: a reader sees the old one or the new one. Where that
+/// fails, what was written of it is removed: on a full disk it would take the room of the next try.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FolderError> {
-    let unfinished = path.with_extension("unfinished");
+    let unfinished = path.with_extension(UNFINISHED);
     let write = || -> io::Result<()> {
         let mut file = File::create(&unfinished)?;
         file.write_all(bytes)?;
@@ -134,5 +152,38 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FolderError> {
         }
         Ok(())
     };
-    write().map_err(fault("write", path))
+    write().map_err(|error| {
+        let _ = fs::remove_file(&unfinished);
+        fault("write", path)(error)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_checkpoint_whose_writing_was_cut_short_is_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = RunFolder::new(folder.path());
+        run.create().unwrap();
+        let cut = run.checkpoints().join("step-1.unfinished");
+        fs::write(&cut, "half of one").unwrap();
+        assert!(!run.has_checkpoint());
+        remove_unfinished(&run.checkpoints()).unwrap();
+        assert!(!cut.exists());
+        write_atomically(&run.checkpoints().join("step-1.safetensors"), b"one").unwrap();
+        assert!(run.has_checkpoint());
+    }
+
+    #[test]
+    fn what_cannot_be_written_whole_leaves_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        // Nothing is renamed over a folder with something in it.
+        let path = folder.path().join("model.safetensors");
+        fs::create_dir_all(path.join("something")).unwrap();
+        let error = write_atomically(&path, b"a model").unwrap_err().to_string();
+        assert!(error.starts_with("cannot write") && error.contains("model.safetensors"), "{error}");
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
 }

@@ -73,6 +73,8 @@ pub struct TrainerConfig {
     pub run: String,
     /// The character, in models' metadata.
     pub character: String,
+    /// Physics steps a second, likewise.
+    pub physics_hz: u32,
     /// The run's seed.
     pub seed: u64,
     /// Replays that the run's transitions are in.
@@ -225,13 +227,18 @@ impl Trainer {
             match source.poll(STARVED) {
                 Ok(Some(minibatch)) => {
                     self.metrics.wait_seconds.observe(asked.elapsed().as_secs_f64());
-                    let priorities = self.tick(minibatch)?;
+                    let priorities = self.tick(minibatch).inspect_err(|_| self.show_stopped())?;
                     if !priorities.is_empty() {
                         source.update_priorities(priorities)?;
                     }
                     asked = Instant::now();
                 }
-                Ok(None) => self.take_reports()?,
+                Ok(None) => {
+                    self.take_reports()?;
+                    if self.pace.is_time_to_show() {
+                        self.show();
+                    }
+                }
                 Err(SampleError::Shutdown) => break,
                 Err(error) => return Err(error.into()),
             }
@@ -377,6 +384,21 @@ impl Trainer {
 
     /// Tells hub and metrics where the training stands.
     fn show(&self) {
+        let state = match self.ending {
+            Some(_) => "finished",
+            None if self.refill.is_going_on() => "filling",
+            None if self.sac.updates() == 0 => "waiting",
+            None => "training",
+        };
+        self.show_as(state, self.pace.per_second());
+    }
+
+    /// The same, once an update has failed and no other will follow.
+    fn show_stopped(&self) {
+        self.show_as("stopped", 0.0);
+    }
+
+    fn show_as(&self, state: &'static str, updates_per_second: f64) {
         let (stage, env_steps) = (self.curriculum.stage(), self.progress.env_steps);
         let stage_env_steps = self.curriculum.stage_steps(env_steps);
         let stage_limit = self.curriculum.stage_limit().unwrap_or(0);
@@ -388,17 +410,11 @@ impl Trainer {
         self.metrics.evaluations_outstanding.set(self.hub.outstanding() as i64);
         self.metrics.filling.set(i64::from(self.refill.is_going_on()));
         self.metrics.finished.set(i64::from(self.ending.is_some()));
-        let state = match self.ending {
-            Some(_) => "finished",
-            None if self.refill.is_going_on() => "filling",
-            None if self.sac.updates() == 0 => "waiting",
-            None => "training",
-        };
         self.hub.set_standing(Standing {
             state,
             env_steps,
             updates: self.sac.updates(),
-            updates_per_second: self.pace.per_second(),
+            updates_per_second,
             stage,
             beta: self.curriculum.beta(),
             stage_env_steps,

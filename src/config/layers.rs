@@ -18,8 +18,21 @@ pub(super) const PRESETS: [(&str, &str); 5] = [
     ("gpu", include_str!("../presets/gpu.toml")),
 ];
 
-/// Environment variables with our prefix that are no settings.
-const NOT_SETTINGS: [&str; 3] = ["GETUP_TEST_", "GETUP_PEERS_", PRESET_VARIABLE];
+/// Environment variables with our prefix that are no settings: beginnings of their names. The last ones are of the cluster's
+/// compose files.
+const NOT_SETTINGS: [&str; 11] = [
+    "GETUP_TEST_",
+    "GETUP_PEERS_",
+    PRESET_VARIABLE,
+    "GETUP_IMAGE",
+    "GETUP_TAG",
+    "GETUP_SETTINGS",
+    "GETUP_GRAFANA_PORT",
+    "GETUP_PROMETHEUS_PORT",
+    "GETUP_REPLAY_",
+    "GETUP_LEARNER_",
+    "GETUP_ACTOR_",
+];
 /// Chooses the preset where the command line does not.
 pub(super) const PRESET_VARIABLE: &str = "GETUP_PRESET";
 
@@ -64,11 +77,8 @@ impl Layers {
         variables: impl Iterator<Item = (OsString, OsString)>,
     ) -> Result<()> {
         let ours = variables.filter_map(|(name, value)| Some((name.into_string().ok()?, value)));
-        let mut settings: Vec<(String, OsString)> = ours
-            .filter(|(name, _)| {
-                name.starts_with("GETUP_") && !NOT_SETTINGS.iter().any(|other| name.starts_with(other))
-            })
-            .collect();
+        let mut settings: Vec<(String, OsString)> =
+            ours.filter(|(name, _)| name.starts_with("GETUP_") && !is_no_setting(name)).collect();
         settings.sort();
         for (name, value) in settings {
             let key = name["GETUP_".len()..].to_lowercase().replace("__", ".");
@@ -118,6 +128,12 @@ impl Layers {
             .try_into()
             .map_err(|error: toml::de::Error| anyhow!("{}", error.to_string().trim()))
     }
+}
+
+/// Whether a variable with our prefix is there for something else. In a setting's name the underscore after a table is
+/// doubled.
+fn is_no_setting(name: &str) -> bool {
+    NOT_SETTINGS.iter().any(|other| name.strip_prefix(other).is_some_and(|rest| !rest.starts_with('_')))
 }
 
 /// `a.b = value` as tables.

@@ -42,8 +42,7 @@ pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Sta
     let trainer = make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, start)?;
     note_config(config, folder)?;
     let bar = Progress::start(role, config, Arc::clone(&hub));
-    // The writer's id is part of every random draw of the lanes: here it is the number of the start.
-    let identity = Identity { writer: incarnation, ..Identity::new(&config.actor.name, config.seed) };
+    let identity = Identity::of_start(&config.actor.name, config.seed, incarnation);
     let setup = crate::actor::setup(config, role, identity, folder.root().join("diverged"))?;
     let options = sample_options(config, incarnation);
     store.check_options(&options)?;

@@ -8,7 +8,7 @@ use super::{ConfigError, check};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CurriculumConfig {
-    /// β of stage 0, the upper clip of β̂, and the actuators' clamp where above 1.
+    /// β of stage 0; where above 1, also the upper clip of β̂ and the actuators' clamp, which else are 1.
     pub beta_start: f64,
     /// β never goes under it.
     pub beta_floor: f64,

@@ -226,10 +226,12 @@ impl SacConfig {
         check(rate > 0.0 && rate <= 100.0, "sac.updates_per_step", &rate, "over 0, at most 100")
     }
 
-    /// Refuses settings under which nothing is learned by networks that begin untrained.
+    /// Refuses settings under which nothing is learned by networks that begin untrained: minibatches, of which statistics
+    /// are made, come after the uniform steps.
     pub fn validate_untrained(&self) -> Result<(), ConfigError> {
-        let known = !self.normalize_observations || self.normalize_until > 0;
-        let wanted = "over 0, unless the run begins with another's networks and statistics (--from)";
+        let known = !self.normalize_observations || self.normalize_until > self.uniform_steps;
+        let wanted =
+            "over sac.uniform_steps, unless the run begins with another's networks and statistics (--from)";
         check(known, "sac.normalize_until", &self.normalize_until, wanted)
     }
 
@@ -263,6 +265,19 @@ impl SacConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn observations_are_normalised_by_minibatches_which_come_after_the_uniform_steps() {
+        let config = |normalize_until| SacConfig {
+            normalize_observations: true,
+            uniform_steps: 5_000,
+            normalize_until,
+            ..SacConfig::default()
+        };
+        assert!(config(5_001).validate_untrained().is_ok());
+        let error = config(5_000).validate_untrained().unwrap_err().to_string();
+        assert!(error.contains("sac.normalize_until = 5000: over sac.uniform_steps"), "{error}");
+    }
 
     #[test]
     fn learning_rates_fall_linearly_and_stay_where_they_fell_to() {

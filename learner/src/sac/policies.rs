@@ -7,12 +7,13 @@ use super::Sac;
 use crate::networks::Actor;
 use crate::parameters::to_vec;
 
-/// A model whose actor a run cannot begin with.
+/// A model or a checkpoint whose actor a run cannot go on with.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error(
-    "the model's {what}: {found}; the configuration's: {wanted}: begin with another model, or set [sac] as its run did"
+    "the {of}'s {what}: {found}; the configuration's: {wanted}: take another {of}, or set [sac] as its run did"
 )]
 pub struct ActorMismatch {
+    of: &'static str,
     what: &'static str,
     found: String,
     wanted: String,
@@ -47,18 +48,11 @@ impl Sac {
 
     /// Puts another run's actor in the place of the untrained one, with the statistics that it learned under.
     pub(crate) fn begin_with(&mut self, policy: &Policy) -> Result<(), ActorMismatch> {
-        let mismatch =
-            |what: &'static str, found: String, wanted: String| ActorMismatch { what, found, wanted };
         if policy.shape != self.actor.shape {
-            let shapes = [&policy.shape, &self.actor.shape].map(|shape| format!("{shape:?}"));
-            let [found, wanted] = shapes;
-            return Err(mismatch("shape", found, wanted));
+            let [found, wanted] = [&policy.shape, &self.actor.shape].map(|shape| format!("{shape:?}"));
+            return Err(ActorMismatch { of: "model", what: "shape", found, wanted });
         }
-        let normalizes = |does: bool| if does { "normalised" } else { "as they are" }.to_owned();
-        if policy.statistics.is_some() != self.config.normalize_observations {
-            let (found, wanted) = (policy.statistics.is_some(), self.config.normalize_observations);
-            return Err(mismatch("observations", normalizes(found), normalizes(wanted)));
-        }
+        self.check_normalizes("model", policy.statistics.is_some())?;
         self.actor = Actor::new(policy, self.config.precision.kind(self.device), self.device);
         if let Some(statistics) = &policy.statistics {
             self.statistics.begin_with(statistics);
@@ -66,5 +60,16 @@ impl Sac {
         self.began_trained = true;
         self.changed();
         Ok(())
+    }
+
+    /// Refuses networks that learned to read observations otherwise than this run gives them.
+    pub(crate) fn check_normalizes(&self, of: &'static str, found: bool) -> Result<(), ActorMismatch> {
+        let wanted = self.config.normalize_observations;
+        if found == wanted {
+            return Ok(());
+        }
+        let [found, wanted] =
+            [found, wanted].map(|does| if does { "normalised" } else { "as they are" }.to_owned());
+        Err(ActorMismatch { of, what: "observations", found, wanted })
     }
 }

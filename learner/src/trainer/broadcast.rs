@@ -64,6 +64,7 @@ impl Trainer {
             ("stage", self.curriculum.stage().to_string()),
             ("task", "getup".to_owned()),
             ("character", self.config.character.clone()),
+            ("physics_hz", self.config.physics_hz.to_string()),
             ("run", self.config.run.clone()),
             ("seed", self.config.seed.to_string()),
             ("env_steps", self.progress.env_steps.to_string()),

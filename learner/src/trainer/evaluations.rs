@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::{Ending, TrainError, Trainer};
 use crate::curriculum::{Decision, Outcome, StageResult};
 use crate::hub::Evaluation;
-use crate::run_folder::append_line;
+use crate::run_folder::{append_line, write_atomically};
 
 /// A line of `evaluations.jsonl`.
 #[derive(Debug, Serialize)]
@@ -124,15 +124,18 @@ impl Trainer {
         if let Some(beta) = passed {
             let model = Policy::from_bytes(&evaluation.policy.networks[0].model)?;
             let mut model = self.describe(model, beta);
+            // The curriculum is in the next stage already, and training went on meanwhile.
+            model.metadata.insert("stage".into(), evaluation.policy.stage.to_string());
             model.metadata.insert("env_steps".into(), evaluation.policy.env_steps.to_string());
             model.metadata.insert("updates".into(), evaluation.updates.to_string());
             model.metadata.insert("evaluation_mean".into(), line.mean.to_string());
             model.metadata.insert("evaluation_min".into(), line.min.to_string());
             model.metadata.insert("evaluation_stands".into(), line.stands.to_string());
             if decision != Decision::Better {
-                model.save(self.folder.model(&format!("stage-{}", evaluation.policy.stage)))?;
+                let stage = format!("stage-{}", evaluation.policy.stage);
+                write_atomically(&self.folder.model(&stage), &model.to_bytes())?;
             }
-            model.save(self.folder.model("best"))?;
+            write_atomically(&self.folder.model("best"), &model.to_bytes())?;
         }
         if !matches!(decision, Decision::Ignore | Decision::Stay) {
             // On disk before anybody hears of the next stage: the curriculum never goes back, nor does its best policy.
