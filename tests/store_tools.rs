@@ -53,9 +53,22 @@ fn a_runs_store_is_inspected_verified_mended_compacted_and_exported() {
     );
     assert!(again.contains("run.npz exists already"), "{again}");
 
-    // A hole in the oldest file.
+    // The oldest file is missing: what is left is not exported as if it were all.
     let segments = folder.join(store).join("segments");
     let oldest = fs::read_dir(&segments).unwrap().map(|entry| entry.unwrap().path()).min().unwrap();
+    fs::rename(&oldest, folder.join("aside")).unwrap();
+    for format in ["npz", "minari"] {
+        let mut export = getup(&["replay", "export", store, "--format", format, "--output", "holes-v0"]);
+        let refused = fail(export.current_dir(folder));
+        assert!(
+            refused.contains("damaged") && refused.contains("getup replay repair run/replay"),
+            "{refused}"
+        );
+        assert!(!folder.join("holes-v0").exists());
+    }
+    fs::rename(folder.join("aside"), &oldest).unwrap();
+
+    // A hole in it.
     let mut bytes = fs::read(&oldest).unwrap();
     let hole = bytes.len() / 2;
     bytes[hole..hole + 64].fill(0);

@@ -61,6 +61,18 @@ pub enum StoreError {
         /// What was found.
         what: String,
     },
+    /// Its `store.json` is missing or cannot be read: nothing says whose transitions it holds.
+    #[error(
+        "the replay store {dir} cannot be used: {what}. store.json is written once and never changes: copy it from a \
+         snapshot or a backup of this store (such as {dir}/snapshots/NAME/store.json); or move the folder away to begin \
+         with an empty replay (models, checkpoints and the learner's state lie elsewhere and are not touched)"
+    )]
+    Manifest {
+        /// Where it is.
+        dir: PathBuf,
+        /// What was found.
+        what: String,
+    },
     /// The disk refuses.
     #[error(
         "the replay store cannot {action} {path}: {source}. Check the disk's space and permissions, then start again"
@@ -100,6 +112,10 @@ impl StoreError {
 
     pub(crate) fn damaged(dir: impl Into<PathBuf>, what: impl Into<String>) -> Self {
         Self::Damaged { dir: dir.into(), what: what.into() }
+    }
+
+    pub(crate) fn manifest(dir: impl Into<PathBuf>, what: impl Into<String>) -> Self {
+        Self::Manifest { dir: dir.into(), what: what.into() }
     }
 
     /// What sled reports about the store in `dir`.

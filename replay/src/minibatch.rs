@@ -100,14 +100,29 @@ pub struct MinibatchColumn {
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]
 pub enum OptionsError {
     /// An empty or enormous batch.
-    #[error(
-        "a batch of {batch} cannot be sampled: it must lie in 1..={max}, so that a message and the store hold it"
-    )]
+    #[error("a batch of {batch} cannot be sampled: it must lie in 1..={max}, so that a message holds it")]
     Batch {
         /// As asked for.
         batch: usize,
         /// What a message holds.
         max: usize,
+    },
+    /// A batch for which the store might never have the draws.
+    #[error(
+        "a batch of {batch} might wait forever: with replay.capacity {capacity} a store that was full is sure to hold {held} \
+         transitions, and replay.max_times_sampled is {times}; take {max} or less, or raise either setting"
+    )]
+    Draws {
+        /// As asked for.
+        batch: usize,
+        /// The largest that always comes.
+        max: usize,
+        /// Transitions that a store which was full holds at least.
+        held: usize,
+        /// As configured.
+        times: u32,
+        /// As configured.
+        capacity: usize,
     },
     /// A batch that the limiter's band has no room for.
     #[error(

@@ -104,9 +104,7 @@ impl Ring {
     pub(crate) fn new(spec: &RunSpec, config: &ReplayConfig) -> Self {
         let capacity = config.capacity;
         let layout = Layout::new(spec);
-        // One row more a segment: enough where segments have 8 steps on average. Below that rows run out before
-        // transitions do, and the ring holds somewhat fewer.
-        let slots = capacity + capacity / 8 + spec.max_segment_steps + 1;
+        let slots = slots(spec, config);
         Self {
             values: vec![0.0; slots * layout.stride],
             slots: Slots::new(slots, config.remover == Remover::Fifo),
@@ -122,6 +120,19 @@ impl Ring {
             pushed: 0,
             stored_before: 0,
         }
+    }
+
+    /// Transitions that a ring holds at least from its first removal on, however long its segments are.
+    ///
+    /// With segments of up to L steps: one is removed where a new one has no room, so that afterwards less than L
+    /// transitions lack to the capacity, or at most L slots are free; and at least half of the rows begin a transition.
+    /// Where not the oldest leave first, age may remove up to L − 1 transitions more than come.
+    pub(crate) fn held_at_least(spec: &RunSpec, config: &ReplayConfig) -> usize {
+        let longest = spec.max_segment_steps;
+        let by_transitions = config.capacity - (longest - 1);
+        let by_rows = (slots(spec, config) - longest).div_ceil(2);
+        let by_age = if config.remover == Remover::Fifo { 0 } else { longest - 1 };
+        by_transitions.min(by_rows) - by_age
     }
 
     /// Adds a segment that follows the ring's spec, and removes others to make room.
@@ -382,6 +393,12 @@ impl Ring {
             self.unfinished.insert(lane, number);
         }
     }
+}
+
+/// Rows that a ring has room for. One more a segment than transitions: enough where segments have 8 steps on average. Below
+/// that rows run out before transitions do, and the ring holds fewer: see [`Ring::held_at_least`].
+fn slots(spec: &RunSpec, config: &ReplayConfig) -> usize {
+    config.capacity + config.capacity / 8 + spec.max_segment_steps + 1
 }
 
 impl Layout {

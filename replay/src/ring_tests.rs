@@ -114,6 +114,48 @@ fn an_evicted_segment_is_forgotten_by_those_that_would_continue_it() {
     assert!(ring.segments.iter().all(|entry| entry.continued_by.is_none()));
 }
 
+proptest! {
+    #[test]
+    fn a_ring_that_was_full_holds_at_least_what_it_says_whatever_its_segments(
+        segments in prop::collection::vec((prop_oneof![Just(1usize), Just(8), 1usize..=8], 0.0f32..2.0), 1..200),
+        capacity in 16usize..80,
+        window in prop::option::of(1u32..4),
+    ) {
+        let spec = fixtures::spec(8);
+        let (sampler, remover) = match window {
+            None => (ItemSelector::Uniform, Remover::Fifo),
+            Some(window) => (ItemSelector::Prioritized { exponent: 1.0 }, Remover::LowestPriority { window }),
+        };
+        let config = ReplayConfig { capacity, sampler, remover, ..ReplayConfig::default() };
+        let least = Ring::held_at_least(&spec, &config);
+        let (mut ring, mut pushed) = (Ring::new(&spec, &config), 0);
+        for (sequence, (steps, priority)) in (1..).zip(segments) {
+            ring.push(&fixtures::segment(&spec, 1, sequence, steps));
+            for key in pushed..pushed + steps as u64 {
+                ring.set_priority(key, priority);
+            }
+            pushed += steps as u64;
+            prop_assert!(ring.len() as u64 == pushed || ring.len() >= least, "{} and not {}", ring.len(), least);
+        }
+    }
+}
+
+#[test]
+fn a_ring_that_was_full_may_hold_no_more_than_it_says() {
+    let spec = fixtures::spec(8);
+    // The longest segment leaves for one of a single step, where transitions run out, and where rows do.
+    let mut many = vec![1; 38];
+    many[0] = 8;
+    for (capacity, lengths, least) in [(16, vec![8, 8, 1], 9), (64, many, 37)] {
+        let config = ReplayConfig { capacity, ..ReplayConfig::default() };
+        let mut ring = Ring::new(&spec, &config);
+        for (sequence, steps) in (1..).zip(lengths) {
+            ring.push(&fixtures::segment(&spec, 1, sequence, steps));
+        }
+        assert_eq!((ring.len(), Ring::held_at_least(&spec, &config)), (least, least));
+    }
+}
+
 /// A ring that the segments of the lowest priority leave first.
 fn by_priority(spec: &RunSpec, capacity: usize, window: u32, max_times_sampled: Option<u32>) -> Ring {
     let sampler = ItemSelector::Prioritized { exponent: 1.0 };

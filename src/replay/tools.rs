@@ -51,7 +51,7 @@ pub(crate) enum Tool {
         #[arg(long)]
         json: bool,
     },
-    /// Write a store's transitions for other tools: NumPy's .npz, or a Minari dataset.
+    /// Write a store's transitions for other tools: NumPy's .npz, or a Minari dataset. A damaged store is refused.
     Export {
         /// The store's folder, such as runs/laptop-0/replay. It may be in use.
         dir: PathBuf,
@@ -199,8 +199,16 @@ fn export(dir: &Path, format: Format, output: Option<PathBuf>, id: Option<String
         id.is_none() || matches!(format, Format::Minari),
         "--id names a Minari dataset: leave it out with npz"
     );
+    let survey = survey(dir)?;
+    ensure!(
+        survey.damages.is_empty(),
+        "the store is damaged, and an export would leave out what is missing: {}. `getup replay repair {}` keeps the \
+         rest, which can be exported then",
+        survey.damages.join("; "),
+        dir.display()
+    );
     let (spec, segments) = getup_replay::segments(dir)?;
-    let bar = progress_bar(Survey::read(dir, |_| {})?.transitions, "transitions");
+    let bar = progress_bar(survey.transitions, "transitions");
     let progress = |transitions| bar.set_position(transitions);
     let (path, exported) = match format {
         Format::Npz => {

@@ -51,6 +51,31 @@ pub(crate) fn remove(dir: &Path, first: u64) -> Result<(), StoreError> {
     }
 }
 
+/// Removes a folder with all that is in it; one that is gone already is as good.
+pub(crate) fn remove_folder(path: &Path) -> Result<(), StoreError> {
+    match fs::remove_dir_all(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(StoreError::io("remove", path)(error)),
+        _ => Ok(()),
+    }
+}
+
+/// Makes all files of the store in `dir` durable on the disk, whoever wrote them and with whichever [`SyncMode`].
+///
+/// What a disk refused at an earlier sync may be lost unnoticed: the kernel reports that once, and then takes it for
+/// written.
+pub(crate) fn sync(dir: &Path) -> Result<(), StoreError> {
+    for first in list(dir)? {
+        let path = path(dir, first);
+        File::open(&path).and_then(|file| file.sync_all()).map_err(StoreError::io("sync", path))?;
+    }
+    sync_names(&dir.join(FOLDER))
+}
+
+/// Makes the names in a folder durable on the disk.
+pub(crate) fn sync_names(folder: &Path) -> Result<(), StoreError> {
+    File::open(folder).and_then(|file| file.sync_all()).map_err(StoreError::io("sync", folder))
+}
+
 /// The end of a log: the file that takes its commits.
 #[derive(Debug)]
 pub(crate) struct Tail {

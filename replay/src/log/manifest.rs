@@ -1,6 +1,7 @@
 //! `store.json`: which format a store has, whose transitions it holds, and its name.
 //!
-//! It lies beside the log, so that any later version can read it before it touches that.
+//! It lies beside the log, so that any later version can read it before it touches that. It is written once, and a
+//! snapshot's is the same.
 
 use crate::error::StoreError;
 use getup_proto::RunSpec;
@@ -53,12 +54,12 @@ impl Manifest {
         }
         let text = fs::read(&path).map_err(StoreError::io("read", &path))?;
         let damaged =
-            |error: serde_json::Error| StoreError::damaged(dir, format!("{FILE} cannot be read ({error})"));
+            |error: serde_json::Error| StoreError::manifest(dir, format!("{FILE} cannot be read ({error})"));
         let value: serde_json::Value = serde_json::from_slice(&text).map_err(damaged)?;
         match value["format"].as_u64() {
             Some(FORMAT) => {}
             Some(found) => return Err(StoreError::Format { dir: dir.to_owned(), found, ours: FORMAT }),
-            None => return Err(StoreError::damaged(dir, format!("{FILE} names no format"))),
+            None => return Err(StoreError::manifest(dir, format!("{FILE} names no format"))),
         }
         serde_json::from_value(value).map(Some).map_err(damaged)
     }

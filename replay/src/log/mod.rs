@@ -35,6 +35,7 @@ mod writers;
 
 pub(crate) use record::State;
 pub use rewrite::{Rewritten, compact, repair};
+pub(crate) use snapshot::FOLDER as SNAPSHOTS;
 pub use survey::{Ever, Survey, WriterMark, segments};
 pub(crate) use watermark::Watermark;
 
@@ -113,7 +114,11 @@ impl Log {
         let lock = lock(dir)?;
         rewrite::finish(dir)?;
         let (manifest, watermark) = match Manifest::read(dir, spec)? {
-            Some(manifest) => (manifest, Watermark::open(dir)?),
+            Some(manifest) => {
+                rewrite::remove_unfinished(dir)?;
+                snapshot::remove_unfinished(dir)?;
+                (manifest, Watermark::open(dir)?)
+            }
             None => create(dir, spec)?,
         };
         for folder in [files::FOLDER, index::FOLDER] {
@@ -143,6 +148,10 @@ impl Log {
         };
         if let Some(newest) = log.files.back() {
             log.tail = Some(Tail::open(dir, newest.first, end)?);
+        }
+        if config.sync == SyncMode::Data {
+            // What was read back counts as acknowledged from here on, and whoever wrote it may not have synced it.
+            files::sync(dir)?;
         }
         log.watermark.set_acknowledged(state.segments)?;
         Ok(log)
@@ -331,12 +340,12 @@ fn try_lock(dir: &Path) -> Result<File, StoreError> {
 fn create(dir: &Path, spec: &RunSpec) -> Result<(Manifest, Watermark), StoreError> {
     let folder = dir.join(files::FOLDER);
     if folder.is_dir() && !files::list(dir)?.is_empty() {
-        return Err(StoreError::damaged(dir, "it has segments but no store.json"));
+        return Err(StoreError::manifest(dir, "it has segments but no store.json"));
     }
     for folder in [folder, dir.join(index::FOLDER)] {
         fs::create_dir_all(&folder).map_err(StoreError::io("create", folder))?;
     }
-    let watermark = Watermark::create(dir)?;
+    let watermark = Watermark::create(dir, 0, 0)?;
     let manifest = Manifest::new(spec);
     manifest.write(dir)?;
     Ok((manifest, watermark))

@@ -57,6 +57,17 @@ impl State {
         self.episodes += u64::from(segment.end.is_some());
     }
 
+    /// The greater of each total.
+    pub(crate) fn max(self, other: Self) -> Self {
+        Self {
+            segments: self.segments.max(other.segments),
+            env_steps: self.env_steps.max(other.env_steps),
+            transitions: self.transitions.max(other.transitions),
+            episodes: self.episodes.max(other.episodes),
+            oldest: self.oldest.max(other.oldest),
+        }
+    }
+
     pub(crate) fn encode(self) -> Vec<u8> {
         numbers_to_bytes([self.segments, self.env_steps, self.transitions, self.episodes, self.oldest])
     }

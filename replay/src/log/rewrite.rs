@@ -2,7 +2,7 @@
 
 use super::manifest::Manifest;
 use super::survey::{Found, Survey};
-use super::{FOLDERS, Log, State, lock};
+use super::{FOLDERS, Log, State, files, lock};
 use crate::config::{ReplayConfig, SyncMode};
 use crate::error::StoreError;
 use getup_proto::Segment;
@@ -82,10 +82,7 @@ fn survey(dir: &Path, lock: &File) -> Result<Found, StoreError> {
 /// Puts a new log together, without the oldest segments that make up to `excess` transitions; returns its segments
 /// and transitions.
 fn rewrite(dir: &Path, lock: &File, found: &Found, excess: u64) -> Result<(u64, u64), StoreError> {
-    let unfinished = dir.join(UNFINISHED);
-    if unfinished.exists() {
-        fs::remove_dir_all(&unfinished).map_err(StoreError::io("remove", &unfinished))?;
-    }
+    remove_unfinished(dir)?;
     // Just enough that nothing is evicted from it, and that its files are of the usual share.
     let Survey { spec, transitions, .. } = &found.survey;
     let capacity = (transitions - excess).max(2 * spec.max_segment_steps as u64);
@@ -96,16 +93,16 @@ fn rewrite(dir: &Path, lock: &File, found: &Found, excess: u64) -> Result<(u64, 
         ..ReplayConfig::default()
     };
     let mut writing = Writing {
-        dir: unfinished,
+        dir: dir.join(UNFINISHED),
         found,
         config,
         excess,
         log: None,
         group: Vec::new(),
-        state: State::default(),
+        state: found.before(),
         error: None,
     };
-    Found::read(dir, Some(lock), |before, segment| writing.take(before, segment))?;
+    Found::read(dir, Some(lock), |number, segment| writing.take(number, segment))?;
     writing.finish()
 }
 
@@ -117,22 +114,23 @@ struct Writing<'a> {
     excess: u64,
     log: Option<Log>,
     group: Vec<Segment>,
-    /// After what was left out.
+    /// Totals after what was left out.
     state: State,
     error: Option<StoreError>,
 }
 
 impl Writing<'_> {
-    fn take(&mut self, before: State, segment: Segment) {
+    fn take(&mut self, number: u64, segment: Segment) {
         if self.error.is_some() {
             return;
         }
         if self.log.is_none() {
             if segment.steps as u64 <= self.excess {
                 self.excess -= segment.steps as u64;
+                self.state.add(&segment);
                 return;
             }
-            self.error = self.begin(before).err();
+            self.error = self.begin(number).err();
         }
         self.group.push(segment);
         if self.group.len() == GROUP {
@@ -140,10 +138,11 @@ impl Writing<'_> {
         }
     }
 
-    /// Begins the log behind the totals `before`; the marks of writers whose segments are gone come along.
-    fn begin(&mut self, before: State) -> Result<(), StoreError> {
-        let marks = self.found.writers.iter().filter(|(_, mark)| mark.segment < before.segments);
-        let log = Log::begin(&self.dir, &self.found.survey.spec, &self.config, before, marks.collect())?;
+    /// Begins the log where the segment `number` is the first that is written; the marks of writers whose segments are
+    /// gone come along.
+    fn begin(&mut self, number: u64) -> Result<(), StoreError> {
+        let marks = self.found.writers.iter().filter(|(_, mark)| mark.segment < number);
+        let log = Log::begin(&self.dir, &self.found.survey.spec, &self.config, self.state, marks.collect())?;
         if let Some(sampled) = self.found.survey.sampled {
             log.watermark().set_sampled(sampled)?;
         }
@@ -163,8 +162,7 @@ impl Writing<'_> {
         self.write();
         if self.log.is_none() && self.error.is_none() {
             // Nothing is left, and the totals are not forgotten.
-            let totals = self.found.end;
-            self.error = self.begin(totals).err();
+            self.error = self.begin(self.found.end.segments).err();
         }
         match (self.error, self.log) {
             (None, Some(log)) => {
@@ -181,14 +179,14 @@ impl Writing<'_> {
 /// is killed leaves what the next one finishes.
 fn swap(dir: &Path, aside: Option<&str>) -> Result<(), StoreError> {
     let (unfinished, marker) = (dir.join(UNFINISHED), dir.join(UNFINISHED).join(COMPLETE));
-    sync(&unfinished)?;
+    files::sync_names(&unfinished)?;
     let write = || {
         let mut file = File::create(&marker)?;
         file.write_all(aside.unwrap_or_default().as_bytes())?;
         file.sync_all()
     };
     write().map_err(StoreError::io("write", &marker))?;
-    sync(&unfinished)?;
+    files::sync_names(&unfinished)?;
     finish(dir)
 }
 
@@ -196,7 +194,7 @@ fn swap(dir: &Path, aside: Option<&str>) -> Result<(), StoreError> {
 pub(super) fn finish(dir: &Path) -> Result<(), StoreError> {
     let unfinished = dir.join(UNFINISHED);
     let marker = unfinished.join(COMPLETE);
-    if !marker.exists() {
+    if !marker.try_exists().map_err(StoreError::io("read", &marker))? {
         return Ok(());
     }
     let aside = fs::read_to_string(&marker).map_err(StoreError::io("read", &marker))?;
@@ -212,14 +210,15 @@ pub(super) fn finish(dir: &Path) -> Result<(), StoreError> {
             fs::rename(&new, &old).map_err(StoreError::io("move", &new))?;
         }
     }
-    sync(dir)?;
+    files::sync_names(dir)?;
     if aside.is_empty() {
         fs::remove_dir_all(&replaced).map_err(StoreError::io("remove", &replaced))?;
     }
     fs::remove_dir_all(&unfinished).map_err(StoreError::io("remove", &unfinished))
 }
 
-/// Makes the names in a folder durable.
-fn sync(folder: &Path) -> Result<(), StoreError> {
-    File::open(folder).and_then(|file| file.sync_all()).map_err(StoreError::io("sync", folder))
+/// Removes what a rewriting that was killed before its swap has left: to be called after [`finish`], which takes what a swap
+/// needs. The store must be locked.
+pub(super) fn remove_unfinished(dir: &Path) -> Result<(), StoreError> {
+    files::remove_folder(&dir.join(UNFINISHED))
 }

@@ -17,11 +17,16 @@ use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
+/// The snapshots' folder in the store's.
+pub(crate) const FOLDER: &str = "snapshots";
+/// Ends the name of a snapshot that is put together.
+const UNFINISHED: &str = ".unfinished";
+
 /// A snapshot that has begun; [`Snapshot::finish`] when appends go on.
 #[derive(Debug)]
 pub(crate) struct Snapshot {
     /// Where it is put together, and where it goes then.
-    unfinished: PathBuf,
+    unfinished: Unfinished,
     dir: PathBuf,
     /// The store's name: a learner that goes on with the copy has counted what is in it.
     store: u64,
@@ -39,17 +44,10 @@ impl Log {
             let exists = io::Error::from(io::ErrorKind::AlreadyExists);
             return Err(StoreError::io("create", dir)(exists));
         }
-        // No snapshot can be called so: a name that begins with a dot is refused.
-        let name = dir.file_name().unwrap_or_default().to_string_lossy();
-        let unfinished = dir.with_file_name(format!(".{name}.unfinished"));
-        if unfinished.exists() {
-            fs::remove_dir_all(&unfinished).map_err(StoreError::io("remove", &unfinished))?;
-        }
-        let segments = unfinished.join(files::FOLDER);
-        fs::create_dir_all(&segments).map_err(StoreError::io("create", &segments))?;
+        let unfinished = Unfinished::create(dir)?;
         let full = self.files.len().saturating_sub(1);
         for file in self.files.iter().take(full) {
-            let (from, to) = (files::path(&self.dir, file.first), files::path(&unfinished, file.first));
+            let (from, to) = (files::path(&self.dir, file.first), files::path(&unfinished.0, file.first));
             fs::hard_link(&from, &to).map_err(StoreError::io("link", from))?;
         }
         let read = |newest: &super::Held| {
@@ -81,18 +79,61 @@ impl Snapshot {
     /// Copies the rest, and gives the snapshot its name: it is there whole, or not at all.
     pub(crate) fn finish(self, spec: &RunSpec) -> Result<(), StoreError> {
         let Self { unfinished, dir, store, state, marks, sampled, newest } = self;
+        let folder = &unfinished.0;
         if let Some((first, file, bytes)) = newest {
-            let to = files::path(&unfinished, first);
+            let to = files::path(folder, first);
             let copy = || io::copy(&mut file.take(bytes), &mut File::create_new(&to)?);
             copy().map_err(StoreError::io("write", &to))?;
         }
-        let (mut index, _) = Index::open(&unfinished, SyncMode::Data)?;
+        files::sync(folder)?;
+        let (mut index, _) = Index::open(folder, SyncMode::Data)?;
         index.write(&Content { oldest: state.oldest, marks }, &[])?;
         drop(index);
-        let watermark = Watermark::create(&unfinished)?;
-        watermark.set_acknowledged(state.segments)?;
-        watermark.set_sampled(sampled)?;
-        Manifest { store, ..Manifest::new(spec) }.write(&unfinished)?;
-        fs::rename(&unfinished, &dir).map_err(StoreError::io("move", &dir))
+        Watermark::create(folder, state.segments, sampled)?;
+        Manifest { store, ..Manifest::new(spec) }.write(folder)?;
+        fs::rename(folder, &dir).map_err(StoreError::io("move", &dir))?;
+        files::sync_names(&dir.join(".."))
     }
+}
+
+/// The folder where a snapshot is put together. It is removed again unless it was renamed: its links would keep the space
+/// of files that the store has dropped.
+#[derive(Debug)]
+struct Unfinished(PathBuf);
+
+impl Unfinished {
+    /// For the snapshot `dir`, beside it.
+    fn create(dir: &Path) -> Result<Self, StoreError> {
+        // No snapshot can be called so: a name that begins with a dot is refused.
+        let name = dir.file_name().unwrap_or_default().to_string_lossy();
+        let unfinished = Self(dir.with_file_name(format!(".{name}{UNFINISHED}")));
+        files::remove_folder(&unfinished.0)?;
+        let segments = unfinished.0.join(files::FOLDER);
+        fs::create_dir_all(&segments).map_err(StoreError::io("create", &segments))?;
+        Ok(unfinished)
+    }
+}
+
+impl Drop for Unfinished {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Removes what snapshots that were killed have left in the store `dir`, which must be locked.
+pub(super) fn remove_unfinished(dir: &Path) -> Result<(), StoreError> {
+    let folder = dir.join(FOLDER);
+    let entries = match fs::read_dir(&folder) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+        entries => entries.map_err(StoreError::io("read", &folder))?,
+    };
+    for entry in entries {
+        let entry = entry.map_err(StoreError::io("read", &folder))?;
+        let name = entry.file_name();
+        let name = name.to_string_lossy();
+        if name.starts_with('.') && name.ends_with(UNFINISHED) {
+            files::remove_folder(&entry.path())?;
+        }
+    }
+    Ok(())
 }

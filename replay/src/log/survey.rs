@@ -95,12 +95,12 @@ pub(super) struct Found {
 }
 
 impl Found {
-    /// As [`Survey::read`]; `visit` also gets the totals before the segment. The index is read under the store's `lock`
+    /// As [`Survey::read`]; `visit` also gets the segment's number in the log. The index is read under the store's `lock`
     /// alone.
     pub(super) fn read(
         dir: &Path,
         lock: Option<&File>,
-        visit: impl FnMut(State, Segment),
+        visit: impl FnMut(u64, Segment),
     ) -> Result<Self, StoreError> {
         let manifest = Manifest::existing(dir)?;
         // Asked before the files are read: what is acknowledged later may be in none of them.
@@ -112,10 +112,10 @@ impl Found {
         let sampled = watermark.ok().and_then(|watermark| watermark.sampled().ok());
         let mut reading = Reading {
             acknowledged: acknowledged.as_ref().ok().copied(),
-            oldest: 0,
+            oldest: None,
             dir,
             spec: &manifest.spec,
-            before: None,
+            begun: false,
             state: State::default(),
             writers: Writers::default(),
             survey: Survey {
@@ -155,10 +155,23 @@ impl Found {
         survey.writers.sort_unstable_by_key(|mark| mark.writer);
         Ok(Self { survey, end: state, writers, unread })
     }
+
+    /// Totals before the segments that are there, if nothing is missing between them: what is missing counts as evicted, and
+    /// the totals over the store's life stay.
+    pub(super) fn before(&self) -> State {
+        let Survey { segments, env_steps, transitions, episodes, .. } = self.survey;
+        State {
+            segments: self.end.segments - segments,
+            env_steps: self.end.env_steps - env_steps,
+            transitions: self.end.transitions - transitions,
+            episodes: self.end.episodes - episodes,
+            ..self.end
+        }
+    }
 }
 
 /// The spec of the store in `dir`, and its segments, oldest first. The store may be written meanwhile: what it had when
-/// this was called is read, but for what it evicts.
+/// this was called is read, but for what it evicts. Segments that are missing are not noticed: [`Survey::read`] does.
 ///
 /// # Errors
 /// [`StoreError`] if there is no store; an item is an error where a file is damaged, and the last one then.
@@ -199,11 +212,11 @@ struct Reading<'a, V> {
     dir: &'a Path,
     /// Segments that were; none where that is not known.
     acknowledged: Option<u64>,
-    /// Number of the oldest segment that is kept; what lies before is on its way out.
-    oldest: u64,
+    /// Number of the oldest segment that is kept; what lies before is on its way out. None where that is not known.
+    oldest: Option<u64>,
     spec: &'a RunSpec,
-    /// Totals before the first segment that is there.
-    before: Option<State>,
+    /// Whether the next file must go on where something before it ended.
+    begun: bool,
     /// Totals after what was read.
     state: State,
     writers: Writers,
@@ -212,7 +225,7 @@ struct Reading<'a, V> {
     visit: V,
 }
 
-impl<V: FnMut(State, Segment)> Reading<'_, V> {
+impl<V: FnMut(u64, Segment)> Reading<'_, V> {
     /// The marks of writers whose segments are gone, and where the log begins.
     fn read_index(&mut self) {
         if !self.dir.join(index::FOLDER).is_dir() {
@@ -222,7 +235,7 @@ impl<V: FnMut(State, Segment)> Reading<'_, V> {
         match Index::open(self.dir, SyncMode::Process) {
             Ok((_, content)) => {
                 content.marks.into_iter().for_each(|(writer, mark)| self.writers.restore(writer, mark));
-                self.oldest = content.oldest;
+                self.oldest = Some(content.oldest);
             }
             Err(error @ StoreError::Damaged { .. }) => self.survey.damages.push(what(error)),
             Err(error) => self.unread = Some(error),
@@ -235,7 +248,14 @@ impl<V: FnMut(State, Segment)> Reading<'_, V> {
             return Ok(());
         }
         let mut firsts = files::list(self.dir)?;
-        firsts.retain(|&first| first >= self.oldest);
+        if let Some(oldest) = self.oldest {
+            firsts.retain(|&first| first >= oldest);
+            if let Some(&first) = firsts.first()
+                && first != oldest
+            {
+                self.damage(first, &format!("the file of segment {oldest} should come before it"));
+            }
+        }
         for (place, &first) in firsts.iter().enumerate() {
             self.read_file(first, place + 1 == firsts.len());
         }
@@ -245,8 +265,11 @@ impl<V: FnMut(State, Segment)> Reading<'_, V> {
     fn read_file(&mut self, first: u64, newest: bool) {
         let content = match files::read(self.dir, first) {
             Ok(content) => content,
-            // Dropped since it was listed.
-            Err(_) if !files::path(self.dir, first).exists() => return,
+            // Dropped since it was listed, and all before it were.
+            Err(_) if !files::path(self.dir, first).exists() => {
+                self.begun = false;
+                return;
+            }
             Err(error) => return self.survey.damages.push(what(error)),
         };
         self.survey.files += 1;
@@ -289,36 +312,40 @@ impl<V: FnMut(State, Segment)> Reading<'_, V> {
         self.acknowledged.is_some_and(|acknowledged| self.state.segments >= acknowledged)
     }
 
-    /// Goes on with a file that begins after the totals `header`.
+    /// Goes on with a file that begins after the totals `header`: what is missing before it is in them.
     fn go_on(&mut self, first: u64, header: State) {
+        if header.segments != first {
+            self.damage(
+                first,
+                &format!("it begins after {} segments, and its name says {first}", header.segments),
+            );
+        }
         let counts = |state: State| State { oldest: 0, ..state };
-        if self.before.is_some() && counts(header) != counts(self.state) {
+        if self.begun && counts(header) != counts(self.state) {
             self.damage(
                 first,
                 &format!(
-                    "it begins after {} segments, and what comes before has {}",
-                    header.segments, self.state.segments
+                    "it begins after {} segments and {} transitions, and what comes before has {} and {}",
+                    header.segments, header.transitions, self.state.segments, self.state.transitions
                 ),
             );
         }
-        if self.before.is_none() || header.segments > self.state.segments {
-            self.state = header;
-        }
-        self.before.get_or_insert(header);
+        self.state = self.state.max(header);
+        self.begun = true;
     }
 
     fn take(&mut self, segment: Segment) {
-        let before = self.state;
-        self.before.get_or_insert(before);
+        let number = self.state.segments;
+        self.begun = true;
         let Survey { segments, transitions, env_steps, episodes, value_bytes, .. } = &mut self.survey;
         *segments += 1;
         *transitions += segment.steps as u64;
         *env_steps += u64::from(segment.env_steps);
         *episodes += u64::from(segment.end.is_some());
         *value_bytes += segment.columns.iter().map(|column| column.len() as u64).sum::<u64>();
-        self.writers.restore(segment.writer, Mark { sequence: segment.sequence, segment: before.segments });
+        self.writers.restore(segment.writer, Mark { sequence: segment.sequence, segment: number });
         self.state.add(&segment);
-        (self.visit)(before, segment);
+        (self.visit)(number, segment);
     }
 
     fn damage(&mut self, first: u64, text: &str) {

@@ -113,23 +113,80 @@ fn another_run_another_format_and_a_second_process_are_refused_with_the_way_out(
 #[test]
 fn a_missing_or_damaged_small_file_is_named() {
     let spec = fixtures::spec(64);
-    for (file, content) in [
-        ("store.json", Some("{\"format\": 2")),
-        ("store.json", Some("{}")),
-        ("store.json", None),
-        ("watermark", Some("short")),
-        ("watermark", None),
-    ] {
+    for content in [Some("short"), None] {
         let dir = TempDir::new().unwrap();
         written(dir.path(), &spec, 3);
-        match content {
-            Some(content) => fs::write(dir.path().join(file), content).unwrap(),
-            None => fs::remove_file(dir.path().join(file)).unwrap(),
-        }
+        replace(&dir.path().join("watermark"), content);
         let refused = open(dir.path(), &spec, 256).unwrap_err().to_string();
-        assert!(refused.contains("damaged") && refused.contains(file), "{refused}");
+        assert!(refused.contains("damaged") && refused.contains("watermark"), "{refused}");
         assert!(refused.contains("replay repair"), "{refused}");
     }
+}
+
+/// Gives a file other content, or removes it.
+fn replace(file: &Path, content: Option<&str>) {
+    match content {
+        Some(content) => fs::write(file, content).unwrap(),
+        None => fs::remove_file(file).unwrap(),
+    }
+}
+
+#[test]
+fn a_missing_or_damaged_manifest_is_named_and_a_snapshots_takes_its_place() {
+    let spec = fixtures::spec(64);
+    for content in [Some("{\"format\": 2"), Some("{}"), None] {
+        let dir = TempDir::new().unwrap();
+        let segments = written(dir.path(), &spec, 3);
+        let snapshot = dir.path().join(SNAPSHOTS).join("nightly");
+        let (log, _) = open(dir.path(), &spec, 10_000).unwrap();
+        log.begin_snapshot(&snapshot).unwrap().finish(&spec).unwrap();
+        let store = log.store();
+        drop(log);
+        let manifest = dir.path().join("store.json");
+        replace(&manifest, content);
+        let refused = open(dir.path(), &spec, 10_000).unwrap_err().to_string();
+        assert!(refused.contains("store.json") && refused.contains("copy it from a snapshot"), "{refused}");
+        assert!(!refused.contains("replay repair"), "it needs the file too: {refused}");
+        fs::copy(snapshot.join("store.json"), &manifest).unwrap();
+        let (log, found) = open(dir.path(), &spec, 10_000).unwrap();
+        assert_eq!((log.store(), found), (store, segments));
+    }
+}
+
+#[test]
+fn a_snapshot_that_fails_leaves_nothing() {
+    let (dir, spec) = (TempDir::new().unwrap(), fixtures::spec(8));
+    let (mut log, _) = open(dir.path(), &spec, 256).unwrap();
+    for sequence in 1..=30 {
+        log.append(&[fixtures::segment(&spec, 1, sequence, 8)]).unwrap();
+    }
+    let snapshots = dir.path().join(SNAPSHOTS);
+    // Something takes its name while it is put together.
+    let taken = snapshots.join("taken");
+    let begun = log.begin_snapshot(&taken).unwrap();
+    fs::create_dir_all(taken.join("something")).unwrap();
+    begun.finish(&spec).unwrap_err();
+    // The second of the files cannot be linked.
+    files::remove(dir.path(), log.files[1].first).unwrap();
+    log.begin_snapshot(&snapshots.join("second")).unwrap_err();
+    let left: Vec<_> = fs::read_dir(&snapshots).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(left, ["taken"]);
+}
+
+#[test]
+fn what_a_killed_snapshot_or_rewriting_left_is_removed_when_the_store_is_opened() {
+    let (dir, spec) = (TempDir::new().unwrap(), fixtures::spec(64));
+    let segments = written(dir.path(), &spec, 3);
+    let snapshots = dir.path().join(SNAPSHOTS);
+    let left = [snapshots.join(".nightly.unfinished"), dir.path().join("rewriting")];
+    let whole = snapshots.join("nightly");
+    for folder in [&left[0], &left[1], &whole] {
+        fs::create_dir_all(folder.join(files::FOLDER)).unwrap();
+        fs::hard_link(files::path(dir.path(), 0), files::path(folder, 0)).unwrap();
+    }
+    let (_, found) = open(dir.path(), &spec, 10_000).unwrap();
+    assert_eq!(found, segments);
+    assert!(left.iter().all(|folder| !folder.exists()) && files::path(&whole, 0).exists());
 }
 
 #[test]

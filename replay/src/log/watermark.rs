@@ -26,14 +26,14 @@ pub(crate) struct Watermark {
 }
 
 impl Watermark {
-    /// Of a new store: nothing acknowledged, nothing sampled.
-    pub(crate) fn create(dir: &Path) -> Result<Self, StoreError> {
+    /// Of a new store, durable on the disk: so many segments acknowledged, so many transitions sampled.
+    pub(crate) fn create(dir: &Path, acknowledged: u64, sampled: u64) -> Result<Self, StoreError> {
         let path = dir.join(FILE);
         let options = OpenOptions::new().read(true).write(true).create(true).truncate(true).clone();
         let file = options.open(&path).map_err(StoreError::io("create", &path))?;
         let watermark = Self { file, path };
-        watermark.write(ACKNOWLEDGED_AT, 0)?;
-        watermark.write(SAMPLED_AT, 0)?;
+        watermark.write(ACKNOWLEDGED_AT, acknowledged)?;
+        watermark.write(SAMPLED_AT, sampled)?;
         watermark.file.sync_all().map_err(StoreError::io("write", &watermark.path))?;
         Ok(watermark)
     }

@@ -11,6 +11,7 @@ mod sample;
 
 use crate::config::DEFAULT_TABLE;
 use crate::error::StoreError;
+use crate::log::SNAPSHOTS;
 use crate::metrics::ReplayMetrics;
 use crate::store::Store;
 use crate::tables::Tables;
@@ -37,8 +38,6 @@ const GRACE: Duration = Duration::from_secs(3);
 const HELLO_PATIENCE: Duration = Duration::from_secs(10);
 /// Bytes of a stream that may be on their way to a server that is not reading: some tens of segments.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
-/// Where snapshots go, in the store's folder.
-const SNAPSHOTS: &str = "snapshots";
 /// Priorities of a request: they are given under a lock that appends and samples wait for.
 const MOST_PRIORITIES: usize = 1 << 17;
 /// Replies that may wait for a client that is not reading.

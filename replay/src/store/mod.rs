@@ -38,6 +38,8 @@ pub struct Store {
     id: u64,
     capacity: usize,
     max_times_sampled: Option<u32>,
+    /// Transitions that can be sampled at least, once it was full.
+    held_at_least: usize,
     /// Whether draws change the ring.
     selects: bool,
     /// Locked by one append at a time, for as long as the disk takes.
@@ -109,6 +111,7 @@ impl Store {
             id: log.store(),
             capacity: config.capacity,
             max_times_sampled: config.max_times_sampled,
+            held_at_least: Ring::held_at_least(spec, config),
             selects: ring.selects(),
             watermark: log.watermark().clone(),
             log: Mutex::new(log),

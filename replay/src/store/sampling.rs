@@ -29,10 +29,12 @@ impl Store {
         if !(1..=max).contains(&batch) {
             return Err(OptionsError::Batch { batch, max });
         }
-        let most =
-            self.max_times_sampled.map_or(usize::MAX, |times| self.capacity.saturating_mul(times as usize));
-        if batch > most {
-            return Err(OptionsError::Batch { batch, max: most });
+        if let Some(times) = self.max_times_sampled {
+            let (held, capacity) = (self.held_at_least, self.capacity);
+            let max = held.saturating_mul(times as usize);
+            if batch > max {
+                return Err(OptionsError::Draws { batch, max, held, times, capacity });
+            }
         }
         let error_buffer = self.gate.limiter().largest_sample();
         if batch as f64 > error_buffer {

@@ -3,11 +3,11 @@
 
 use crate::common::{self, PATIENCE, Writer, config, open};
 use crate::fixtures::{segment, spec};
-use getup_replay::{MinibatchSource, RemoteOptions, RemoteSource, serve};
+use getup_replay::{MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, SyncMode, serve};
 use getup_telemetry::{Registry, Shutdown, Waits};
 use std::collections::HashMap;
 use std::io::{BufRead, BufReader};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -154,14 +154,20 @@ ssize_t pwrite64(int file, const void *bytes, size_t count, off_t at) {
 }
 "#;
 
-#[test]
-fn a_slow_disk_holds_up_writers_and_not_samplers_and_loses_nothing() {
-    let dir = TempDir::new().unwrap();
-    let (source, library) = (dir.path().join("slow.c"), dir.path().join("slow.so"));
-    std::fs::write(&source, SLOW_WRITES).unwrap();
+/// Compiles a library that comes before all others.
+fn library(folder: &Path, code: &str) -> PathBuf {
+    let (source, library) = (folder.join("library.c"), folder.join("library.so"));
+    std::fs::write(&source, code).unwrap();
     let compiled =
         Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&library).arg(&source).arg("-ldl").status();
     assert!(compiled.unwrap().success());
+    library
+}
+
+#[test]
+fn a_slow_disk_holds_up_writers_and_not_samplers_and_loses_nothing() {
+    let dir = TempDir::new().unwrap();
+    let library = library(dir.path(), SLOW_WRITES);
     let store = dir.path().join("store");
     let (mut child, endpoint) = start_with(&store, Some(&library));
     let runtime = tokio::runtime::Runtime::new().unwrap();
@@ -185,6 +191,69 @@ fn a_slow_disk_holds_up_writers_and_not_samplers_and_loses_nothing() {
     runtime.block_on(writing).unwrap();
     let store = open(&store, &spec(STEPS), &config()).unwrap();
     assert!(store.introduce(1, "actor") >= acknowledged.load(Ordering::SeqCst));
+}
+
+/// Says on stderr which files and folders are synced.
+const TOLD_SYNCS: &str = r#"
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <stdio.h>
+#include <unistd.h>
+
+int fsync(int file) {
+    static int (*real)(int);
+    if (!real) real = (int (*)(int))dlsym(RTLD_NEXT, "fsync");
+    char link[64], path[4096];
+    snprintf(link, sizeof link, "/proc/self/fd/%d", file);
+    ssize_t length = readlink(link, path, sizeof path);
+    if (length > 0) dprintf(2, "synced %.*s\n", (int)length, path);
+    return real(file);
+}
+"#;
+const OPENED: &str = "the store is open\n";
+
+/// The process whose syncs are told: without its variable there is nothing to prove here.
+#[test]
+fn opens_and_copies_a_store_that_syncs() {
+    let Some(dir) = std::env::var_os(DIR) else { return };
+    let dir = Path::new(&dir);
+    let synced = ReplayConfig { sync: SyncMode::Data, ..config() };
+    let store = open(dir, &spec(STEPS), &synced).unwrap();
+    eprint!("{OPENED}");
+    store.snapshot(&dir.join("snapshots/copy")).unwrap();
+}
+
+#[test]
+fn with_sync_data_what_is_read_back_reaches_the_disk_before_it_counts_and_so_does_a_snapshot() {
+    let folder = TempDir::new().unwrap();
+    let library = library(folder.path(), TOLD_SYNCS);
+    let dir = folder.path().canonicalize().unwrap().join("store");
+    // By a process that did not sync.
+    let store = open(&dir, &spec(STEPS), &config()).unwrap();
+    store.append(vec![segment(&spec(STEPS), 1, 1, STEPS)]).unwrap();
+    drop(store);
+    let output = Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "kill::opens_and_copies_a_store_that_syncs", "--nocapture"])
+        .env(DIR, &dir)
+        .env("LD_PRELOAD", &library)
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    let (opening, copying) = said.split_once(OPENED).unwrap();
+    let newest = "segments/00000000000000000000.seg";
+    let copied = "snapshots/.copy.unfinished";
+    for (said, name) in [
+        (opening, newest.to_owned()),
+        (opening, "segments".to_owned()),
+        (copying, format!("{copied}/{newest}")),
+        (copying, format!("{copied}/segments")),
+        (copying, format!("{copied}/watermark")),
+        (copying, "snapshots".to_owned()),
+    ] {
+        let line = format!("synced {}\n", dir.join(&name).display());
+        assert!(said.contains(&line), "{name} is not synced:\n{said}");
+    }
 }
 
 fn sampler(endpoint: &str, runtime: &tokio::runtime::Runtime) -> RemoteSource {

@@ -103,6 +103,68 @@ fn repair_mends_a_lost_index_and_a_lost_watermark() {
     }
 }
 
+/// What a start refuses with `named` is mended, with at least so many of its segments and the totals over its life.
+fn is_refused_and_mended(dir: &Path, named: &str, kept: usize, transitions: u64) {
+    let settings = ReplayConfig { capacity: 256, ..config() };
+    let refused = open(dir, &spec(STEPS), &settings).unwrap_err().to_string();
+    assert!(refused.contains("damaged") && refused.contains(named), "{refused}");
+    let damages = Survey::read(dir, |_| {}).unwrap().damages;
+    assert!(damages.iter().any(|damage| damage.contains(named)), "{damages:?}");
+    let repaired = repair(dir).unwrap();
+    assert!(repaired.old.is_some() && repaired.segments >= kept as u64, "{repaired:?}");
+    let survey = Survey::read(dir, |_| {}).unwrap();
+    assert_eq!((survey.damages.as_slice(), survey.segments), ([].as_slice(), repaired.segments));
+    let store = open(dir, &spec(STEPS), &settings).unwrap();
+    let counters = store.counters();
+    assert_eq!((counters.env_steps, counters.transitions), (transitions, transitions));
+    store.append(vec![segment(&spec(STEPS), 1, 1_000, STEPS)]).unwrap();
+    assert_eq!(store.counters().transitions, transitions + STEPS as u64);
+}
+
+#[test]
+fn a_store_whose_oldest_file_is_missing_is_damaged_and_can_be_mended() {
+    // One that holds all that it ever stored, and one that has evicted most.
+    for count in [20, 100] {
+        let dir = TempDir::new().unwrap();
+        let held = written(dir.path(), 256, count);
+        fs::remove_file(&files(dir.path())[0]).unwrap();
+        is_refused_and_mended(dir.path(), "should come before it", held.len() - 2, count * STEPS as u64);
+        assert_eq!(read(dir.path())[..held.len() - 2], held[2..]);
+    }
+}
+
+#[test]
+fn a_file_under_another_files_name_is_damage_and_can_be_mended() {
+    let dir = TempDir::new().unwrap();
+    let held = written(dir.path(), 256, 20);
+    let newest = files(dir.path()).pop().unwrap();
+    fs::rename(&newest, newest.with_file_name("00000000000000000777.seg")).unwrap();
+    is_refused_and_mended(
+        dir.path(),
+        "00000000000000000777.seg: it begins after 18 segments",
+        held.len(),
+        160,
+    );
+}
+
+#[test]
+fn repair_keeps_the_totals_of_what_was_evicted_and_of_what_is_lost() {
+    let dir = TempDir::new().unwrap();
+    let held = written(dir.path(), 256, 100);
+    let oldest = &files(dir.path())[0];
+    let mut bytes = fs::read(oldest).unwrap();
+    bytes[..40].fill(0);
+    fs::write(oldest, bytes).unwrap();
+    is_refused_and_mended(dir.path(), "its header cannot be read", held.len(), 800);
+    assert_eq!(read(dir.path())[..held.len()], held);
+
+    // A file in the middle, of two segments.
+    let dir = TempDir::new().unwrap();
+    let held = written(dir.path(), 256, 100);
+    fs::remove_file(&files(dir.path())[3]).unwrap();
+    is_refused_and_mended(dir.path(), "what comes before has", held.len() - 2, 800);
+}
+
 #[test]
 fn compacting_keeps_the_newest_the_totals_and_the_marks() {
     let dir = TempDir::new().unwrap();

@@ -73,6 +73,30 @@ fn waiting(replay: &Replay) -> String {
 }
 
 #[test]
+fn a_batch_that_a_full_store_might_never_have_the_draws_for_is_refused() {
+    let dir = TempDir::new().unwrap();
+    let times = |max_times_sampled| ReplayConfig { max_times_sampled, capacity: 64, ..config() };
+    let store = open(dir.path(), &spec(STEPS), &times(Some(2))).unwrap();
+    // Of single steps it holds 40, for their rows take all the memory.
+    for sequence in 1..=200 {
+        store.append(vec![segment(&spec(STEPS), 1, sequence, 1)]).unwrap();
+    }
+    assert_eq!(store.len(), 40);
+    let refused = store.check_options(&options(2 * 64)).unwrap_err().to_string();
+    for named in ["a batch of 128", "replay.capacity 64", "replay.max_times_sampled is 2", "take 74 or less"]
+    {
+        assert!(refused.contains(named), "{refused}");
+    }
+    // After the longest segment they may be 37: see the ring.
+    assert!(store.check_options(&options(2 * 37 + 1)).is_err());
+    store.check_options(&options(2 * 37)).unwrap();
+    assert!(store.try_sample(&mut Sampler::new(1), &options(2 * 37)).unwrap().is_some());
+    drop(store);
+    // Without a limit any batch comes.
+    open(dir.path(), &spec(STEPS), &times(None)).unwrap().check_options(&options(1_000)).unwrap();
+}
+
+#[test]
 fn lifo_hands_out_the_newest() {
     let dir = TempDir::new().unwrap();
     let newest =

@@ -213,7 +213,7 @@ fn options_out_of_range_are_refused(connect: Connect) {
     };
     assert!(refused(options(0)).contains("a batch of 0"));
     assert!(refused(options(33)).contains("raise it to the batch"));
-    assert!(refused(options(1 << 30)).contains("a message and the store hold it"));
+    assert!(refused(options(1 << 30)).contains("so that a message holds it"));
     assert!(refused(SampleOptions { n_step: 0, ..options(8) }).contains("n_step is 0"));
     assert!(refused(SampleOptions { gamma: 1.5, ..options(8) }).contains("gamma is 1.5"));
     assert!(refused(SampleOptions { gamma: f32::NAN, ..options(8) }).contains("gamma is NaN"));
