@@ -37,7 +37,7 @@ OMEGA = 60.0
 ENV_STEPS, MINUTES = "env steps", "wall time (minutes)"
 
 # One run's line is a shade of its family's colour; the families differ in lightness too.
-FAMILIES = ("Blues", "Oranges", "Greens", "Purples")
+FAMILIES = ("Blues", "Oranges", "Greens", "Purples", "Greys")
 # The ablation's kinds: label and colour, of Okabe and Ito's colour-blind-safe set.
 ABLATION = {
     "curriculum": ("strong-to-weak curriculum", "#0072B2"),
@@ -208,9 +208,14 @@ def draw_omega(axes):
 
 def over_steps_and_minutes(y_label):
     """Two panels with one y axis: (panel, what its x axis is)."""
-    figure, panels = plt.subplots(1, 2, sharey=True, figsize=(9, 3.5))
+    figure, panels = plt.subplots(1, 2, sharey=True, figsize=(10.5, 4))
     panels[0].set_ylabel(y_label)
     return figure, tuple(zip(panels, (ENV_STEPS, MINUTES)))
+
+
+def say_which_is_which(figure, axes):
+    """One legend for panels with the same lines, beside them: there are too many runs for a place among the lines."""
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")
 
 
 def learning_curve(runs):
@@ -223,7 +228,7 @@ def learning_curve(runs):
         draw_omega(axes)
         label_x(axes, axis)
         axes.set_ylim(bottom=0)
-    panels[1][0].legend(loc="lower right")
+    say_which_is_which(figure, panels[1][0])
     return figure
 
 
@@ -238,7 +243,7 @@ def torque_limit(runs):
             axes.plot(run.against(axis), run.column("beta"), **style)
         axes.axhline(1, color="#333333", linestyle=(0, (1, 2)), linewidth=1.1, label="the character’s own")
         label_x(axes, axis)
-    panels[1][0].legend(loc="upper right")
+    say_which_is_which(figure, panels[1][0])
     return figure
 
 
