@@ -54,6 +54,10 @@ fn two_replays_share_the_work_and_one_that_is_killed_delays_nobody_and_loses_not
         sharded.wait_for(shard, "env_steps_total", 300.0);
         sharded.wait_for(shard, "sampled_transitions_total", 1_000.0);
     }
+    wait_for("each has its half", LIMIT, || {
+        let stored = [0, 1].map(|shard| sharded.metric(shard, "env_steps_total"));
+        (stored[0].min(stored[1]) > 0.8 * stored[0].max(stored[1])).then_some(())
+    });
 
     second.signal("KILL");
     assert!(!second.wait(LIMIT).success());
