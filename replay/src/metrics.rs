@@ -2,6 +2,7 @@
 
 use crate::config::DEFAULT_TABLE;
 use crate::disk::Disk;
+use crate::log::State;
 use getup_telemetry::prometheus::{
     Gauge, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry, core::Collector,
     exponential_buckets,
@@ -26,6 +27,7 @@ pub struct ReplayMetrics {
     pub(crate) commit_segments: Histogram,
     pub(crate) sample_seconds: Histogram,
     rejected: IntCounterVec,
+    registry: Registry,
 }
 
 impl ReplayMetrics {
@@ -48,10 +50,8 @@ impl ReplayMetrics {
         let gauge = |name: &str, help: &str| {
             added(registry, IntGauge::with_opts(options(name, help)).expect(WELL_FORMED))
         };
-        // Counters begin at the totals of earlier processes.
-        let counter = |name: &str, help: &str| {
-            added(registry, IntCounter::with_opts(options(name, help)).expect(WELL_FORMED))
-        };
+        // Registered by `begin_at`.
+        let counter = |name: &str, help: &str| IntCounter::with_opts(options(name, help)).expect(WELL_FORMED);
         let float = |name: &str, help: &str| {
             added(registry, Gauge::with_opts(options(name, help)).expect(WELL_FORMED))
         };
@@ -97,6 +97,21 @@ impl ReplayMetrics {
                 16,
             ),
             rejected: added(registry, rejected),
+            registry: registry.clone(),
+        }
+    }
+
+    /// Shows the counters over the store's life from here on, beginning at the totals of earlier processes. Shown before the
+    /// store is read back they would begin at 0, and whoever scrapes them would take its whole life for a burst.
+    pub(crate) fn begin_at(&self, state: &State, sampled: u64) {
+        for (counter, total) in [
+            (&self.inserted_env_steps, state.env_steps),
+            (&self.inserted_transitions, state.transitions),
+            (&self.episodes, state.episodes),
+            (&self.sampled, sampled),
+        ] {
+            counter.inc_by(total);
+            added(&self.registry, counter.clone());
         }
     }
 

@@ -94,10 +94,8 @@ impl Store {
                 dir.display()
             );
         }
-        metrics.inserted_env_steps.inc_by(state.env_steps);
-        metrics.inserted_transitions.inc_by(state.transitions);
-        metrics.episodes.inc_by(state.episodes);
-        metrics.sampled.inc_by(sampled);
+        metrics.begin_at(&state, sampled);
+        metrics.transitions.set(ring.len() as i64);
         metrics.capacity.set(config.capacity as i64);
         metrics.memory_bytes.set(ring.memory_bytes() as i64);
         metrics.disk.watch(dir);
