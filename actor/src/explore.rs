@@ -1,8 +1,12 @@
 //! How an actor explores: the draw of β̂ (§5) and of actions (App. D).
 
+use std::collections::BTreeMap;
+
 use getup_policy::squash;
 use rand::Rng;
 use rand_distr::StandardNormal;
+
+use crate::link::{BETA_FLOOR_VALUE, BETA_STD_VALUE};
 
 /// The draw of an episode's torque limit β̂ around the curriculum's β^i (§5).
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -11,11 +15,19 @@ pub struct BetaDraw {
     pub std: f64,
     /// Lower clip, the curriculum's floor: 0.4 in the paper.
     pub floor: f64,
-    /// Upper clip, the curriculum's β^0: 1 in the paper.
+    /// Upper clip: 1, or the curriculum's β^0 where that is above.
     pub ceiling: f64,
 }
 
 impl BetaDraw {
+    /// As an update's named values say, where they do: a fleet has one curriculum, whatever its actors are configured with.
+    /// The ceiling is the actuators', which are an actor's own.
+    pub fn told_by(self, values: &BTreeMap<String, f64>) -> Self {
+        let told = |name: &str, own| values.get(name).copied().unwrap_or(own);
+        let floor = told(BETA_FLOOR_VALUE, self.floor).min(self.ceiling);
+        Self { std: told(BETA_STD_VALUE, self.std), floor, ceiling: self.ceiling }
+    }
+
     /// β̂ ~ N(`beta`, std), clipped to [floor, ceiling]. Drawn at an episode's start and kept throughout.
     pub fn draw(&self, beta: f64, rng: &mut impl Rng) -> f32 {
         let noise: f64 = rng.sample(StandardNormal);
@@ -93,6 +105,15 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     const DRAW: BetaDraw = BetaDraw { std: 0.04, floor: 0.4, ceiling: 1.0 };
+
+    #[test]
+    fn an_update_says_how_beta_is_drawn_where_it_says_anything() {
+        let told = |name: &str, value| DRAW.told_by(&[(name.to_owned(), value)].into());
+        assert_eq!(told("beta", 0.5), DRAW);
+        assert_eq!(told(BETA_STD_VALUE, 0.1), BetaDraw { std: 0.1, ..DRAW });
+        assert_eq!(told(BETA_FLOOR_VALUE, 0.3), BetaDraw { floor: 0.3, ..DRAW });
+        assert_eq!(told(BETA_FLOOR_VALUE, 1.5).draw(0.5, &mut ChaCha8Rng::seed_from_u64(0)), 1.0);
+    }
 
     proptest! {
         #[test]

@@ -231,7 +231,7 @@ impl Player {
         self.over = false;
         self.rng = settings.identity.episode_rng(self.index, episode);
         let seed = self.rng.next_u64();
-        self.beta = settings.beta.draw(update.beta, &mut self.rng);
+        self.beta = settings.beta.told_by(&update.values).draw(update.beta, &mut self.rng);
         self.noise.release();
         // Nothing is drawn where nothing is chosen: a run without these settings keeps its episodes.
         let high = update.high_starts > 0.0 && self.rng.random_bool(update.high_starts);

@@ -17,6 +17,11 @@ use tokio::sync::watch;
 pub const POLICY_NETWORK: &str = "policy";
 /// The named value that holds the curriculum's β^i.
 pub const BETA_VALUE: &str = "beta";
+/// The named values that hold the standard deviation of β̂ around β^i, and its floor; where one is absent, an actor goes by its
+/// own configuration.
+pub const BETA_STD_VALUE: &str = "beta_std";
+/// See [`BETA_STD_VALUE`].
+pub const BETA_FLOOR_VALUE: &str = "beta_floor";
 /// The named value that holds the share of episodes that begin high; none where it is absent.
 pub const HIGH_STARTS_VALUE: &str = "high_starts";
 /// The evaluation scenario of the get-up task: falls that their seeds alone determine.
@@ -88,6 +93,16 @@ pub enum UpdateError {
         /// The value, where there is one.
         beta: Option<f64>,
     },
+    /// How β̂ is drawn makes no sense.
+    #[error("policy {version} has {name} {value}: it must be a finite number, at least 0")]
+    BetaDraw {
+        /// Of the update.
+        version: PolicyVersion,
+        /// [`BETA_STD_VALUE`] or [`BETA_FLOOR_VALUE`].
+        name: &'static str,
+        /// As it came.
+        value: f64,
+    },
     /// The share of high starts is none.
     #[error("policy {version} has {HIGH_STARTS_VALUE} {high_starts}: it must be from 0 to 1")]
     HighStarts {
@@ -132,6 +147,13 @@ impl PolicyUpdate {
             Some(value) if value.is_finite() && value > 0.0 => value,
             _ => return Err(UpdateError::Beta { version, beta }),
         };
+        for name in [BETA_STD_VALUE, BETA_FLOOR_VALUE] {
+            if let Some(&value) = wire.values.get(name)
+                && !(value.is_finite() && value >= 0.0)
+            {
+                return Err(UpdateError::BetaDraw { version, name, value });
+            }
+        }
         let high_starts = wire.values.get(HIGH_STARTS_VALUE).copied().unwrap_or(0.0);
         if !(0.0..=1.0).contains(&high_starts) {
             return Err(UpdateError::HighStarts { version, high_starts });
@@ -213,6 +235,7 @@ impl From<Heartbeat> for v1::HeartbeatRequest {
             env_steps: beat.env_steps,
             waiting: beat.waiting,
             leaving: beat.leaving,
+            spec: None,
         }
     }
 }
@@ -343,6 +366,8 @@ mod tests {
             PolicyUpdate::parse(wire).unwrap_err().to_string()
         };
         assert!(refused(&|wire| wire.version = None).contains("names no version"));
+        let spread = refused(&|wire| _ = wire.values.insert(BETA_STD_VALUE.into(), f64::NAN));
+        assert!(spread.contains("has beta_std NaN"), "{spread}");
         assert!(refused(&|wire| wire.networks.clear()).contains("policy 2.7 has no network"));
         assert!(refused(&|wire| wire.networks[0].model.clear()).contains("not a getup model"));
         assert!(refused(&|wire| wire.values.clear()).contains("has beta None"));

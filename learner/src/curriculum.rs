@@ -141,6 +141,11 @@ impl Curriculum {
         self.outcome.map_or(self.beta, Outcome::beta)
     }
 
+    /// β^i of the stage that is trained, or was at the end.
+    pub fn stage_beta(&self) -> f64 {
+        self.beta
+    }
+
     /// M_i, in env steps; none in the discovery.
     pub fn stage_limit(&self) -> Option<u64> {
         self.stage_limit
@@ -149,6 +154,14 @@ impl Curriculum {
     /// N_i so far: env steps spent in this stage when the run is at `env_steps`.
     pub fn stage_steps(&self, env_steps: u64) -> u64 {
         env_steps.saturating_sub(self.stage_start)
+    }
+
+    /// So many env steps count neither for the stage nor for a fixed β's patience: nothing was learned from them.
+    pub fn pause(&mut self, env_steps: u64) {
+        self.stage_start += env_steps;
+        if let Some(best) = &mut self.best {
+            best.env_steps += env_steps;
+        }
     }
 
     /// Share of the episodes that begin high in this stage.
@@ -372,6 +385,20 @@ mod tests {
         assert_eq!(report(50_000, 0.4, 90.0), Decision::Finish(Outcome::Settled { beta: 1.0 }));
         assert_eq!(report(60_000, 1.0, 90.0), Decision::Ignore);
         assert_eq!((curriculum.beta(), curriculum.stage()), (1.0, 0));
+    }
+
+    #[test]
+    fn env_steps_from_which_nothing_is_learned_outlast_no_stage() {
+        let mut curriculum = paper();
+        curriculum.report(result(0, 100_000, 61.0), 100_000);
+        assert_eq!(curriculum.stage_limit(), Some(300_000));
+        // A replay is filled again, after two thirds of the stage.
+        curriculum.pause(150_000);
+        assert_eq!(curriculum.stage_steps(450_000), 200_000);
+        assert_eq!(curriculum.report(result(1, 460_000, 10.0), 460_000), Decision::Stay);
+        let outlasted = Decision::Finish(Outcome::StageOutlasted { beta: 1.0 });
+        assert_eq!(curriculum.report(result(1, 560_000, 10.0), 560_000), outlasted);
+        assert_eq!((curriculum.beta(), curriculum.stage_beta()), (1.0, 0.95));
     }
 
     #[test]

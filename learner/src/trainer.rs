@@ -266,8 +266,10 @@ impl Trainer {
         let started = Instant::now();
         let followed = std::mem::take(&mut minibatch.traces);
         let began = (!followed.is_empty()).then(SystemTime::now);
+        let env_steps = self.progress.env_steps;
         self.progress.count(&minibatch.counters);
         if self.refill.goes_on(&minibatch.counters, self.made(), self.hub.waits()) {
+            self.curriculum.pause(self.progress.env_steps - env_steps);
             if self.pace.is_time_to_show() {
                 self.show();
             }
@@ -345,7 +347,7 @@ impl Trainer {
     pub fn finish(&mut self) -> Result<Ending, TrainError> {
         self.take_reports()?;
         let ending = self.ending.unwrap_or(Ending::Shutdown);
-        let last = self.describe(self.sac.evaluated_policy(), self.curriculum.beta());
+        let last = self.describe(self.sac.evaluated_policy(), self.curriculum.stage_beta());
         last.save(self.folder.model("last"))?;
         if ending != Ending::Shutdown {
             self.publish_final()?;

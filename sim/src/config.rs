@@ -28,7 +28,8 @@ pub struct TaskConfig {
     pub fall_ends: bool,
     /// Share of the `stand` term that a head under `crouch_height` costs in training, from 0 to 1. Without, a crouch pays
     /// nearly as much as standing, and a little dip from it is under the 1.4 m of an evaluation. A run that goes on may
-    /// change both; what its replay holds was paid as it was then.
+    /// change both; what its replay holds was paid as it was then. An actor that is a process of its own goes by its own
+    /// settings: they are to be the same for all.
     pub crouch_cost: f64,
     /// The head's height at which half of that is due, in metres: the middle of a step 0.02 m wide.
     pub crouch_height: f64,

@@ -32,6 +32,8 @@ impl Trainer {
             networks: vec![v1::NamedNetwork { name: "policy".into(), model: policy.to_bytes().into() }],
             values: [
                 ("beta".to_owned(), self.curriculum.beta()),
+                ("beta_std".to_owned(), self.config.curriculum.beta_std),
+                ("beta_floor".to_owned(), self.config.curriculum.beta_floor),
                 ("high_starts".to_owned(), self.curriculum.high_starts()),
             ]
             .into(),
