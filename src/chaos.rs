@@ -217,20 +217,26 @@ impl Plan {
         let patience = Duration::from_secs(60);
         let before = self.wait_until_well(None, Instant::now(), patience).context("before the fault")?.0;
         if let Err(error) = self.shell(&fault.inject) {
-            // Some of it may be there: each command of the heal, whether those before it have found something or not.
-            let _ = self.shell(&format!("set +e\n{}", fault.heal));
+            self.heal_what_there_is(fault);
             return Err(error.context("inject"));
         }
         let (injected, hold) = (Instant::now(), Duration::from_secs_f64(fault.hold));
         let during = fault.trains.then(|| self.wait_until_well(Some(&before), injected, hold));
         self.pause(hold.saturating_sub(injected.elapsed()));
-        if !fault.heal.is_empty() {
-            self.shell(&fault.heal).context("heal")?;
+        if let Err(error) = self.shell(&fault.heal) {
+            self.heal_what_there_is(fault);
+            return Err(error.context("heal"));
         }
         during.transpose().context("during the fault")?;
         // Later than it may, it is still worth knowing when.
         let patience = Duration::from_secs_f64(fault.within + 60.0);
         Ok(self.wait_until_well(Some(&before), Instant::now(), patience)?.1)
+    }
+
+    /// Where only some of a fault is there, since its injection failed or something else happened meanwhile: runs each command
+    /// of the heal, whether those before it have found something or not.
+    fn heal_what_there_is(&self, fault: &Fault) {
+        let _ = self.shell(&format!("set +e\n{}", fault.heal));
     }
 
     /// Watches until the cluster works as before, and that it lost nothing on the way.

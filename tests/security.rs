@@ -119,6 +119,20 @@ fn with_a_token_the_roles_meet_and_whoever_has_none_or_another_is_refused_by_wha
     assert!(error.contains("another token"), "{error}");
 
     let token = std::fs::read_to_string(secrets.join("token")).unwrap();
+    // A replay that comes back with a token of its own, as where a new one reaches machines at different times: those that
+    // it had let in wait until theirs is known.
+    replay.signal("KILL");
+    replay.wait(LIMIT);
+    let unlike = cluster.path().join("unlike");
+    std::fs::write(&unlike, "a-token-that-nobody-else-has-yet\n").unwrap();
+    let mut replay = start(&cluster, "replay", &with(&unlike));
+    wait_for("learner and actor are refused", LIMIT, || (refused(&cluster, "token") >= 4.0).then_some(()));
+    std::fs::write(&unlike, &token).unwrap();
+    let stored = metric(cluster.address("replay_metrics"), "getup_replay_env_steps_total").unwrap();
+    wait_for_env_steps(&cluster, stored + 200.0);
+    learner.assert_running();
+    actor.assert_running();
+
     let run = std::fs::read_to_string(cluster.path().join("runs/smoke/config.toml")).unwrap();
     assert!(!run.contains(token.trim()), "the run's folder holds the token");
     for process in [&mut replay, &mut learner, &mut actor] {

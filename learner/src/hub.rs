@@ -19,7 +19,7 @@ pub(crate) const ACTOR_LOST: Duration = Duration::from_secs(60);
 const ACTOR_FORGOTTEN: Duration = Duration::from_secs(600);
 /// How often those are looked for: not at every heartbeat, or the work would grow with the square of their number.
 const SWEEP: Duration = Duration::from_secs(1);
-/// Policies of which it is known when they were published.
+/// Policies of which it is known when they were published: fewer of them the longer ago it is.
 const PUBLISHED: usize = 1024;
 
 /// Why a message of an actor is refused; nothing was changed.
@@ -142,18 +142,28 @@ impl Hub {
 
     /// The newest policy, now and later. Before the first is published it is empty (no networks).
     pub fn subscribe(&self, spec: &RunSpec) -> Result<watch::Receiver<Arc<v1::PolicyUpdate>>, HubError> {
-        self.spec.check_same(spec)?;
+        self.check(spec)?;
         Ok(self.policy.subscribe())
+    }
+
+    /// Refuses whoever simulates something else than this run.
+    pub fn check(&self, spec: &RunSpec) -> Result<(), HubError> {
+        Ok(self.spec.check_same(spec)?)
     }
 
     /// Broadcasts a policy; whoever has not taken the one before it never sees that one.
     pub fn publish(&self, policy: Arc<v1::PolicyUpdate>) {
         if let Some(version) = policy.version {
-            let mut state = self.lock();
-            state.published.push_back((version.counter, Instant::now()));
-            if state.published.len() > PUBLISHED {
-                state.published.pop_front();
+            let published = &mut self.lock().published;
+            if published.len() == PUBLISHED {
+                // Every second one: the first stays, which is what an actor that hears nothing is behind.
+                let mut stays = false;
+                published.retain(|_| {
+                    stays = !stays;
+                    stays
+                });
             }
+            published.push_back((version.counter, Instant::now()));
         }
         self.policy.send_replace(policy);
     }

@@ -51,11 +51,7 @@ impl Learner for Service {
     ) -> Result<Response<Self::SubscribeStream>, Status> {
         let request = request.into_inner();
         let spec = request.spec.ok_or_else(|| Status::invalid_argument("the subscription names no spec"))?;
-        let spec = RunSpec::parse(spec).map_err(|error| match error {
-            SpecError::Protocol { .. } => Status::failed_precondition(error.to_string()),
-            malformed => Status::invalid_argument(malformed.to_string()),
-        })?;
-        let policies = WatchStream::new(self.hub.subscribe(&spec)?);
+        let policies = WatchStream::new(self.hub.subscribe(&parse(spec)?)?);
         tracing::info!(actor = request.actor, "actor subscribed");
         let updates = policies
             // The state before the first policy is not a policy.
@@ -70,7 +66,11 @@ impl Learner for Service {
         &self,
         request: Request<v1::HeartbeatRequest>,
     ) -> Result<Response<v1::HeartbeatReply>, Status> {
-        Ok(Response::new(self.hub.heartbeat(request.into_inner(), now())?))
+        let mut request = request.into_inner();
+        if let Some(spec) = request.spec.take() {
+            self.hub.check(&parse(spec)?)?;
+        }
+        Ok(Response::new(self.hub.heartbeat(request, now())?))
     }
 
     async fn report(
@@ -84,6 +84,13 @@ impl Learner for Service {
     async fn status(&self, _: Request<v1::StatusRequest>) -> Result<Response<v1::StatusReply>, Status> {
         Ok(Response::new(self.hub.status(now())))
     }
+}
+
+fn parse(spec: v1::RunSpec) -> Result<RunSpec, Status> {
+    RunSpec::parse(spec).map_err(|error| match error {
+        SpecError::Protocol { .. } => Status::failed_precondition(error.to_string()),
+        malformed => Status::invalid_argument(malformed.to_string()),
+    })
 }
 
 /// By the clock of the runtime, which a simulation moves.

@@ -203,6 +203,17 @@ async fn actors_of_another_run_and_without_a_name_are_refused() {
         assert_eq!(error.code(), Code::FailedPrecondition);
         assert!(error.message().contains("other") && error.message().contains("hub"), "{}", error.message());
         assert_eq!(door.heartbeat("", 0, true).await.unwrap_err().code(), Code::InvalidArgument);
+        if let Door::Grpc(client) = &door {
+            // Nor does it take part before its subscription is refused.
+            let request = v1::HeartbeatRequest {
+                actor: "stranger".into(),
+                idle: true,
+                spec: Some(spec("other").to_wire()),
+                ..v1::HeartbeatRequest::default()
+            };
+            let error = client.clone().heartbeat(request).await.unwrap_err();
+            assert_eq!(error.code(), Code::FailedPrecondition, "{error}");
+        }
         door.heartbeat("a", 0, true).await.unwrap();
         let actors = hub.status(Instant::now()).actors;
         assert_eq!(actors.iter().map(|actor| actor.name.as_str()).collect::<Vec<_>>(), ["a"]);
@@ -248,4 +259,21 @@ fn who_is_behind_or_silent_is_seen_and_who_leaves_is_not_missed() {
     assert!(hub.heartbeat(beat("another", 3), much_later).unwrap().lease.is_some());
     assert_eq!(counts(&hub), (0, 1, 1));
     assert_eq!(hub.actors(much_later).len(), 1);
+}
+
+#[test]
+fn who_hears_nothing_falls_behind_without_bound_however_many_policies_there_are() {
+    let hub = hub(Duration::from_secs(10));
+    hub.publish(policy(1));
+    let missed = Instant::now();
+    // As fast as a learner that makes a thousand updates a second, for minutes.
+    for counter in 2..10_000 {
+        let version = Some(v1::PolicyVersion { incarnation: 3, counter });
+        hub.publish(Arc::new(v1::PolicyUpdate { version, ..v1::PolicyUpdate::default() }));
+    }
+    let now = Instant::now() + Duration::from_secs(600);
+    let heard_none = v1::HeartbeatRequest { actor: "deaf".into(), ..v1::HeartbeatRequest::default() };
+    hub.heartbeat(heard_none, now).unwrap();
+    let lag = hub.actors(now)[0].lag;
+    assert!(lag >= now - missed, "{lag:?} since the first, which was {:?} ago", now - missed);
 }

@@ -129,6 +129,8 @@ impl Credentials {
         let mut http = HttpConnector::new();
         http.enforce_http(false);
         http.set_nodelay(options.tcp_nodelay);
+        // Shared by the addresses of a name, within the patience for all of it: a dead one leaves time for the next.
+        http.set_connect_timeout(Some(options.connect_timeout.mul_f64(0.7)));
         let (network, tls) = (network.clone(), self.tls.clone());
         let connector = Connector { http, network, tls, host, patience: options.connect_timeout };
         let channel = endpoint(uri, &options)

@@ -1,6 +1,7 @@
 //! Hears policies from a learner over gRPC, and says heartbeats and reports.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use getup_proto::v1::learner_client::LearnerClient;
 use getup_proto::v1::{self, SubscribeRequest};
@@ -21,6 +22,8 @@ pub struct GrpcLearner {
     spec: RunSpec,
     name: String,
     waits: Waits,
+    /// Whether the learner has let it in before.
+    admitted: AtomicBool,
 }
 
 impl GrpcLearner {
@@ -40,7 +43,7 @@ impl GrpcLearner {
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
         let peer = format!("learner at {}", endpoint.address);
-        Ok(Self { client, peer, spec, name: name.to_owned(), waits })
+        Ok(Self { client, peer, spec, name: name.to_owned(), waits, admitted: AtomicBool::new(false) })
     }
 
     /// One subscription, until it ends; every update ends the wait and the back-off.
@@ -50,9 +53,10 @@ impl GrpcLearner {
         backoff: &mut Backoff,
         waiting: &mut Option<WaitGuard>,
     ) -> Result<(), LinkError> {
-        let error = |status: Status| link_error(&self.peer, &status);
+        let error = |status: Status| self.error(&status);
         let request = SubscribeRequest { spec: Some(self.spec.to_wire()), actor: self.name.clone() };
         let mut updates = self.client.clone().subscribe(request).await.map_err(error)?.into_inner();
+        self.admitted.store(true, Ordering::Relaxed);
         tracing::info!("subscribed to the {}", self.peer);
         while let Some(wire) = updates.message().await.map_err(error)? {
             let update = PolicyUpdate::parse(wire)
@@ -62,6 +66,10 @@ impl GrpcLearner {
             *waiting = None;
         }
         Err(LinkError::Unavailable(format!("{}: it ended the stream", self.peer)))
+    }
+
+    fn error(&self, status: &Status) -> LinkError {
+        link_error(&self.peer, status, self.admitted.load(Ordering::Relaxed))
     }
 
     async fn answer<T>(
@@ -94,8 +102,9 @@ impl LearnerLink for GrpcLearner {
 
     async fn heartbeat(&self, beat: Heartbeat) -> Result<Option<Lease>, LinkError> {
         let mut client = self.client.clone();
-        let call = client.heartbeat(v1::HeartbeatRequest::from(beat));
-        let reply = self.answer(call).await.map_err(|status| link_error(&self.peer, &status))?;
+        let spec = Some(self.spec.to_wire());
+        let call = client.heartbeat(v1::HeartbeatRequest { spec, ..v1::HeartbeatRequest::from(beat) });
+        let reply = self.answer(call).await.map_err(|status| self.error(&status))?;
         let lease = reply.lease.map(Lease::parse).transpose();
         lease.map_err(|error| LinkError::Refused(format!("{}: {error}", self.peer)))
     }
@@ -107,7 +116,7 @@ impl LearnerLink for GrpcLearner {
         match self.answer(client.report(report)).await {
             Ok(_) => Ok(Reported::Accepted),
             Err(status) if status.code() == Code::FailedPrecondition => Ok(Reported::LeaseLost),
-            Err(status) => Err(link_error(&self.peer, &status)),
+            Err(status) => Err(self.error(&status)),
         }
     }
 }

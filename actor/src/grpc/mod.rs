@@ -15,13 +15,15 @@ pub use replay::GrpcReplay;
 /// How long a short call may take to be answered.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// What a status means for the actor: whether another attempt is worth while.
-fn link_error(peer: &str, status: &Status) -> LinkError {
+/// What a status means for the actor: whether another attempt is worth while. `admitted`: whether the peer has let it in
+/// before. Then a token that it does not know is one that reaches the two of them at different times.
+fn link_error(peer: &str, status: &Status, admitted: bool) -> LinkError {
     let said = match status.message() {
         "" => format!("{peer}: {}", status.code()),
         message => format!("{peer}: {message}"),
     };
     match status.code() {
+        Code::Unauthenticated if admitted => LinkError::Unavailable(said),
         Code::InvalidArgument
         | Code::FailedPrecondition
         | Code::Unauthenticated

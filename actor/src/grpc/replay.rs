@@ -24,6 +24,8 @@ pub struct GrpcReplay {
     waits: Waits,
     backoff: Backoff,
     stream: Option<AppendStream>,
+    /// Whether the replay has let it in before.
+    admitted: bool,
 }
 
 /// An append stream that has said hello.
@@ -53,7 +55,17 @@ impl GrpcReplay {
         let peer = format!("replay at {}", endpoint.address);
         // Where a run's transitions go.
         let table = String::new();
-        Ok(Self { client, peer, spec, identity, table, waits, backoff: Backoff::new(), stream: None })
+        Ok(Self {
+            client,
+            peer,
+            spec,
+            identity,
+            table,
+            waits,
+            backoff: Backoff::new(),
+            stream: None,
+            admitted: false,
+        })
     }
 
     /// Appends to this table instead of the default one.
@@ -95,6 +107,7 @@ impl GrpcReplay {
         let replies = self.client.append(UnboundedReceiverStream::new(receiver)).await?.into_inner();
         let mut stream = AppendStream { requests, replies, durable: 0 };
         stream.hear().await?;
+        self.admitted = true;
         tracing::info!(durable_sequence = stream.durable, "connected to the {}", self.peer);
         Ok(stream)
     }
@@ -122,7 +135,7 @@ impl SegmentWriter for GrpcReplay {
                     self.backoff.reset();
                     return Ok(());
                 }
-                Err(status) => link_error(&self.peer, &status),
+                Err(status) => link_error(&self.peer, &status, self.admitted),
             };
             let LinkError::Unavailable(reason) = error else { return Err(error) };
             tracing::debug!("cannot append to the {reason}");

@@ -36,6 +36,8 @@ pub(super) struct Fetching {
     bell: Option<Bell>,
     /// Streams opened so far.
     streams: u64,
+    /// Whether the replay has let it in before.
+    admitted: bool,
 }
 
 /// Why a stream ended.
@@ -72,6 +74,7 @@ impl Fetching {
             explained: false,
             bell,
             streams: 0,
+            admitted: false,
         }
     }
 
@@ -117,7 +120,7 @@ impl Fetching {
         }
         let mut inbound = match client.sample(ReceiverStream::new(outbound)).await {
             Ok(response) => response.into_inner(),
-            Err(status) => return End::from(status),
+            Err(status) => return self.end(status),
         };
         // Taken since credits were last given.
         let mut free = 0;
@@ -126,6 +129,7 @@ impl Fetching {
             tokio::select! {
                 message = inbound.message() => match message {
                     Ok(Some(reply)) => {
+                        self.admitted = true;
                         backoff.reset();
                         asked_why.reset();
                         // What was waited for has come.
@@ -138,7 +142,7 @@ impl Fetching {
                         }
                     }
                     Ok(None) => return End::Gone("it ended the stream".to_owned()),
-                    Err(status) => return End::from(status),
+                    Err(status) => return self.end(status),
                 },
                 taken = self.consumed.recv() => {
                     if taken.is_none() {
@@ -176,6 +180,22 @@ impl Fetching {
                     }
                 },
             }
+        }
+    }
+
+    fn end(&self, status: Status) -> End {
+        let reason = status.message().to_owned();
+        match status.code() {
+            // A token that is not known where another was reaches the two of them at different times.
+            Code::Unauthenticated if self.admitted => End::Gone(reason),
+            Code::InvalidArgument
+            | Code::FailedPrecondition
+            | Code::NotFound
+            | Code::Unimplemented
+            | Code::Unauthenticated
+            | Code::PermissionDenied
+            | Code::OutOfRange => End::Refused(reason),
+            _ => End::Gone(reason),
         }
     }
 
@@ -239,22 +259,6 @@ impl Fetching {
     /// The reason where there is none in particular.
     fn awaited(&self) -> String {
         format!("minibatches from replay at {}", self.endpoint.address)
-    }
-}
-
-impl From<Status> for End {
-    fn from(status: Status) -> Self {
-        let reason = status.message().to_owned();
-        match status.code() {
-            Code::InvalidArgument
-            | Code::FailedPrecondition
-            | Code::NotFound
-            | Code::Unimplemented
-            | Code::Unauthenticated
-            | Code::PermissionDenied
-            | Code::OutOfRange => Self::Refused(reason),
-            _ => Self::Gone(reason),
-        }
     }
 }
 
