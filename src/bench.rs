@@ -19,6 +19,7 @@ use getup_telemetry::{Registry, Shutdown, Waits};
 use getup_transport::{ChannelOptions, Credentials, Endpoint};
 use serde::Serialize;
 use tokio::sync::watch;
+use tokio::task::JoinSet;
 use tokio::time::{sleep_until, timeout};
 
 use crate::config::{ConfigArgs, reached_at};
@@ -92,6 +93,7 @@ struct Sampled {
 /// Of policies, from their publication until they are heard and parsed.
 #[derive(Serialize)]
 struct Broadcast {
+    /// Heard by each listener, on average.
     policies_per_second: f64,
     lag_p50_ms: f64,
     lag_p99_ms: f64,
@@ -162,7 +164,11 @@ impl Report {
             line(format!("minibatches of {batch}"), *minibatches_per_second, "a second");
         }
         if let Some(Broadcast { policies_per_second, lag_p50_ms, lag_p99_ms }) = self.broadcast {
-            line(format!("broadcasts heard, {} listeners", self.writers), policies_per_second, "a second");
+            line(
+                format!("broadcasts heard, {} listeners each", self.writers),
+                policies_per_second,
+                "a second",
+            );
             line("broadcast lag p50".to_owned(), lag_p50_ms, "ms");
             line("broadcast lag p99".to_owned(), lag_p99_ms, "ms");
         }
@@ -241,7 +247,7 @@ impl Bench {
             all.0.extend(times);
             all = (all.0, all.1 + env_steps, all.2 + bytes);
         }
-        ensure!(!all.0.is_empty(), "no segment was acknowledged within {:?}", self.time);
+        ensure!(all.1 > 0, "no segment was acknowledged within {:?}", self.time);
         Ok(all)
     }
 
@@ -280,51 +286,54 @@ impl Bench {
     /// Listeners hear policies, while the learner is asked which is its newest: a lag is counted from the last answer that
     /// did not know of the policy, so that it is at most a question too long, and clocks of other machines do not matter.
     async fn hear(&self) -> Result<Broadcast> {
-        let all = Mutex::new(Vec::new());
-        let (slots, updates): (Vec<_>, Vec<_>) = (0..self.writers).map(|_| watch::channel(None)).unzip();
-        let listeners =
-            slots.into_iter().zip(updates.clone()).enumerate().map(|(index, (slot, mut updates))| {
-                let (endpoint, spec, waits) = (self.learner.clone(), self.spec.clone(), self.waits.clone());
-                let link = GrpcLearner::new(endpoint, spec, &format!("bench-{index}"), waits);
-                let hear = async move { Ok::<_, anyhow::Error>(link?.subscribe(slot).await?) };
-                let heard = &all;
-                let note = async move {
-                    while updates.changed().await.is_ok() {
-                        let version = updates
-                            .borrow_and_update()
-                            .as_ref()
-                            .map(|update: &Arc<PolicyUpdate>| update.version);
-                        let now = Instant::now();
-                        let mut heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
-                        heard.extend(version.map(|version| (version, now)));
-                    }
-                    Ok(())
-                };
-                async { tokio::try_join!(hear, note) }
+        let heard = Arc::new(Mutex::new(Vec::new()));
+        let mut listeners = JoinSet::new();
+        let mut all_updates = Vec::new();
+        for index in 0..self.writers {
+            let (slot, mut updates) = watch::channel(None);
+            all_updates.push(updates.clone());
+            let (endpoint, spec, waits) = (self.learner.clone(), self.spec.clone(), self.waits.clone());
+            let link = GrpcLearner::new(endpoint, spec, &format!("bench-{index}"), waits)?;
+            let heard = Arc::clone(&heard);
+            let note = async move {
+                while updates.changed().await.is_ok() {
+                    let update = updates.borrow_and_update();
+                    let version = update.as_ref().map(|update: &Arc<PolicyUpdate>| update.version);
+                    drop(update);
+                    let now = Instant::now();
+                    let mut heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
+                    heard.extend(version.map(|version| (version, now)));
+                }
+                Ok(())
+            };
+            // Each by itself, or the last would wait until all others have parsed theirs.
+            listeners.spawn(async move {
+                let hear = async { Ok::<_, anyhow::Error>(link.subscribe(slot).await?) };
+                tokio::try_join!(hear, note)
             });
-        let listeners = try_join_all(listeners.collect::<Vec<_>>());
+        }
         let measured = async {
-            let mut updates = updates;
             // Each hears the newest first, which was there before.
-            let first = timeout(PATIENCE, all_heard(&mut updates)).await;
+            let first = timeout(PATIENCE, all_heard(&mut all_updates)).await;
             first.map_err(|_| self.unanswered("not every listener heard a policy", PATIENCE))??;
-            self.publications().await
+            Ok::<_, anyhow::Error>((Instant::now(), self.publications().await?))
         };
-        let published = tokio::select! {
+        let (began, published) = tokio::select! {
             published = measured => published?,
-            ended = listeners => bail!("the learner broadcasts nothing more: {:?}", ended.err()),
+            ended = listeners.join_next() => bail!("the learner broadcasts nothing more: {ended:?}"),
         };
+        let heard = std::mem::take(&mut *heard.lock().unwrap_or_else(PoisonError::into_inner));
+        let count = heard.iter().filter(|(_, at)| *at >= began).count();
         let lag = |(version, at): (PolicyVersion, Instant)| {
             Some(at.saturating_duration_since(*published.get(&version)?).as_secs_f64())
         };
-        let lags: Vec<f64> =
-            all.into_inner().unwrap_or_else(PoisonError::into_inner).into_iter().filter_map(lag).collect();
+        let lags: Vec<f64> = heard.into_iter().filter_map(lag).collect();
         ensure!(
             !lags.is_empty(),
             "no policy was broadcast within {:?}: the learner does not train",
             self.time
         );
-        let policies_per_second = lags.len() as f64 / self.time.as_secs_f64();
+        let policies_per_second = count as f64 / self.writers as f64 / self.time.as_secs_f64();
         let [lag_p50_ms, lag_p99_ms] = milliseconds(lags);
         Ok(Broadcast { policies_per_second, lag_p50_ms, lag_p99_ms })
     }
@@ -384,13 +393,17 @@ impl Writer {
 
     async fn append_until(mut self, until: Instant) -> Result<(Vec<f64>, usize, usize)> {
         let (mut times, mut env_steps, mut bytes) = (Vec::new(), 0, 0);
-        // One that is late is left.
-        while let Ok(appended) = tokio::time::timeout_at(until.into(), self.append_one()).await {
+        loop {
+            let began = Instant::now();
+            let Ok(appended) = tokio::time::timeout_at(until.into(), self.append_one()).await else {
+                // One that hangs is not left out: it takes at least so long.
+                times.push(began.elapsed().as_secs_f64());
+                return Ok((times, env_steps, bytes));
+            };
             let (took, steps, size) = appended?;
             times.push(took.as_secs_f64());
             (env_steps, bytes) = (env_steps + steps, bytes + size);
         }
-        Ok((times, env_steps, bytes))
     }
 }
 

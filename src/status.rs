@@ -43,17 +43,17 @@ pub(crate) async fn run(arguments: Args) -> Result<()> {
         let learner =
             learner.as_ref().map_or_else(|error| json!({"error": format!("{error:#}")}), learner_json);
         println!("{}", json!({"replay": replay, "learner": learner}));
-        return Ok(());
-    }
-    for replay in &replays {
-        match replay {
-            Ok(reply) => print_replay(reply),
-            Err(error) => println!("replay   not reached: {error:#}"),
+    } else {
+        for replay in &replays {
+            match replay {
+                Ok(reply) => print_replay(reply),
+                Err(error) => println!("replay   not reached: {error:#}"),
+            }
         }
-    }
-    match &learner {
-        Ok(reply) => print_learner(reply),
-        Err(error) => println!("learner  not reached: {error:#}"),
+        match &learner {
+            Ok(reply) => print_learner(reply),
+            Err(error) => println!("learner  not reached: {error:#}"),
+        }
     }
     anyhow::ensure!(
         learner.is_ok() || replays.iter().any(Result::is_ok),

@@ -127,12 +127,12 @@ fn set_up_environment(name: &str, python: &Path, requirements: &[&str], what: &s
     let folder = native().join(name);
     let stamp = folder.join("installed");
     let wanted = requirements.join("\n");
-    if fs::read_to_string(&stamp).is_ok_and(|installed| installed == wanted) {
+    if fs::read_to_string(&stamp).is_ok_and(|installed| installed == wanted) && has_pip(python) {
         return Ok(());
     }
     // Standard output belongs to what the environment is made for, such as a table.
     eprintln!("Installing {what} into {}", folder.display());
-    run(Command::new("python3").args(["-m", "venv"]).arg(&folder))?;
+    run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&folder))?;
     let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"];
     run(Command::new(python).args(pip).args(requirements))?;
     fs::write(&stamp, wanted).with_context(|| format!("cannot note the versions in {}", stamp.display()))
@@ -144,16 +144,21 @@ fn install_wheels(wheels: &[&str], what: &str) -> Result<()> {
     println!("Installing {what} into {}", folder.display());
     let pip = pip()?;
     let unfinished = native().join("wheels.unfinished");
-    for old in [&folder, &unfinished] {
-        if old.exists() {
-            fs::remove_dir_all(old).with_context(|| format!("cannot remove {}", old.display()))?;
-        }
-    }
+    let remove = |old: &Path| match old.exists() {
+        true => fs::remove_dir_all(old).with_context(|| format!("cannot remove {}", old.display())),
+        false => Ok(()),
+    };
+    remove(&unfinished)?;
     let mut command = Command::new(pip);
     command.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps", "--target"]);
-    run(command.arg(&unfinished).args(wheels))?;
+    if let Err(error) = run(command.arg(&unfinished).args(wheels)) {
+        // Gigabytes, on what may be a full disk. What was installed before still works.
+        let _ = remove(&unfinished);
+        return Err(error);
+    }
     fs::write(unfinished.join("installed"), wheels.join("\n"))
         .context("cannot note the installed versions")?;
+    remove(&folder)?;
     fs::rename(&unfinished, &folder).with_context(|| format!("cannot move into {}", folder.display()))
 }
 
@@ -161,11 +166,16 @@ fn install_wheels(wheels: &[&str], what: &str) -> Result<()> {
 fn pip() -> Result<PathBuf> {
     let venv = native().join("venv");
     let python = venv.join("bin/python");
-    let works = Command::new(&python).args(["-m", "pip", "--version"]).output();
-    if !works.is_ok_and(|output| output.status.success()) {
+    if !has_pip(&python) {
         run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&venv))?;
     }
     Ok(python)
+}
+
+/// Whether it runs and finds its packages: another version of the system's Python does not.
+fn has_pip(python: &Path) -> bool {
+    let version = Command::new(python).args(["-m", "pip", "--version"]).output();
+    version.is_ok_and(|output| output.status.success())
 }
 
 /// `mujoco-rs` wants a folder that holds `libmujoco.so`; the wheel names it by its version.
