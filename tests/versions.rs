@@ -27,7 +27,8 @@ fn in_other_words(target: &str, ours: &[u8], theirs: &[u8]) -> String {
             let (ours, theirs) = (ours.clone(), theirs.clone());
             std::thread::spawn(move || {
                 pass(client, service, |chunk| {
-                    if let Some(place) = chunk.windows(ours.len()).position(|window| window == ours) {
+                    // A subscription and a heartbeat may come together.
+                    while let Some(place) = chunk.windows(ours.len()).position(|window| window == ours) {
                         chunk[place..place + theirs.len()].copy_from_slice(&theirs);
                     }
                 });

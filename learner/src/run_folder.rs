@@ -128,7 +128,7 @@ pub fn append_line(path: &Path, line: &impl Serialize) -> Result<(), FolderError
 }
 
 /// Removes what a process that was killed had not finished writing to a folder. Nobody may be writing there.
-pub(crate) fn remove_unfinished(folder: &Path) -> Result<(), FolderError> {
+pub fn remove_unfinished(folder: &Path) -> Result<(), FolderError> {
     for entry in fs::read_dir(folder).map_err(fault("read", folder))? {
         let path = entry.map_err(fault("read", folder))?.path();
         if path.extension().is_some_and(|extension| extension == UNFINISHED) {

@@ -176,16 +176,16 @@ async fn an_evaluation_is_leased_kept_alive_and_reported_once() {
 
 #[tokio::test]
 async fn the_lease_of_a_silent_actor_goes_to_another() {
-    let (hub, shutdown) = (hub(Duration::from_millis(300)), Shutdown::new());
+    let (hub, shutdown) = (hub(Duration::from_millis(1_200)), Shutdown::new());
     for door in Door::both(&hub, &shutdown).await {
         hub.offer(Evaluation { policy: policy(5), updates: 1 });
         let lost = door.heartbeat("a", 0, true).await.unwrap().unwrap();
         for _ in 0..4 {
-            tokio::time::sleep(Duration::from_millis(100)).await;
+            tokio::time::sleep(Duration::from_millis(400)).await;
             door.heartbeat("a", lost.id, false).await.unwrap();
             assert!(door.heartbeat("b", 0, true).await.unwrap().is_none(), "heartbeats keep it");
         }
-        tokio::time::sleep(Duration::from_millis(400)).await;
+        tokio::time::sleep(Duration::from_millis(1_600)).await;
         let lease = door.heartbeat("b", 0, true).await.unwrap().unwrap();
         assert_ne!(lease.id, lost.id);
         assert_eq!(door.report(lost.id, &[1.0, 2.0]).await.unwrap_err().code(), Code::FailedPrecondition);

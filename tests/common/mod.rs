@@ -2,10 +2,12 @@
 
 #![allow(dead_code)]
 
+use std::collections::BTreeSet;
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 /// The program under test.
@@ -153,9 +155,16 @@ impl Cluster {
     }
 }
 
-/// An address on loopback that nobody listens at now.
+/// An address on loopback that nobody listens at now, and that nobody else in this process was given.
 pub(crate) fn free_address() -> String {
-    TcpListener::bind("127.0.0.1:0").expect("a free port").local_addr().expect("it is bound").to_string()
+    static GIVEN: Mutex<BTreeSet<u16>> = Mutex::new(BTreeSet::new());
+    loop {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
+        let address = listener.local_addr().expect("it is bound");
+        if GIVEN.lock().expect("nobody fails with it").insert(address.port()) {
+            return address.to_string();
+        }
+    }
 }
 
 /// The text of `/metrics`; none where nobody answers.

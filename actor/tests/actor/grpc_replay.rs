@@ -76,9 +76,14 @@ async fn a_call_returns_only_when_the_replay_has_acknowledged_and_connects_again
     let server = store.serve(any_port());
     let mut writer = writer(&server, spec(), &Waits::new(&Registry::new()));
     store.with(|state| state.silent = true);
-    let call = tokio::time::timeout(Duration::from_millis(300), writer.append(segments(1..=3)));
-    assert!(call.await.is_err());
-    assert_eq!(store.len(), 3);
+    {
+        let mut call = std::pin::pin!(writer.append(segments(1..=3)));
+        tokio::select! {
+            returned = &mut call => panic!("nothing was acknowledged: {returned:?}"),
+            () = eventually("the replay has all", || store.len() == 3) => {}
+        }
+        assert!(tokio::time::timeout(Duration::from_millis(50), call).await.is_err());
+    }
     store.with(|state| state.silent = false);
     writer.append(segments(1..=4)).await.unwrap();
     assert_eq!((store.len(), store.with(|state| state.repeated)), (4, 0));

