@@ -136,7 +136,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let mut failed = 0;
     for fault in plan.sequence(faults, arguments.soak, arguments.seed) {
         if plan.interrupted.is_triggered() {
-            bail!("interrupted: what was injected is healed");
+            bail!("interrupted");
         }
         let outcome = plan.try_fault(fault);
         failed += usize::from(!outcome.passed && !outcome.skipped);

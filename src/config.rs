@@ -392,7 +392,9 @@ mod tests {
         }
         // A setting of such a table is one still.
         assert_eq!(load(&[], &[("GETUP_ACTOR__LANES", "3")]).unwrap().actor.lanes, 3);
-        assert!(load(&[], &[("GETUP_ACTOR__LANS", "3")]).is_err());
+        for misspelled in ["GETUP_ACTOR__LANS", "GETUP_ACTOR_LANES", "GETUP_LEARNER_DEVICE"] {
+            assert!(load(&[], &[(misspelled, "3")]).is_err(), "{misspelled}");
+        }
     }
 
     #[test]

@@ -169,7 +169,8 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_
     role.ready.set();
     let bar = progress::Progress::start(role, config, Arc::clone(&hub));
 
-    let identity = Identity::of_start(&config.actor.name, config.seed, incarnation);
+    let identity =
+        Identity::of_start(&config.actor.name, config.seed, incarnation, |writer| store.knows(writer));
     let writer = StoreWriter::new(store, &identity, role.shutdown.clone());
     let setup = crate::actor::setup(config, role, identity, folder.root().join("diverged"))?;
     let link = HubLink { hub: Arc::clone(&hub), spec, name: config.actor.name.clone() };

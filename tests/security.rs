@@ -121,6 +121,7 @@ fn with_a_token_the_roles_meet_and_whoever_has_none_or_another_is_refused_by_wha
     let token = std::fs::read_to_string(secrets.join("token")).unwrap();
     // A replay that comes back with a token of its own, as where a new one reaches machines at different times: those that
     // it had let in wait until theirs is known.
+    wait_for("updates", LIMIT, || cluster.learner_metric("updates_total").filter(|updates| *updates > 0.0));
     replay.signal("KILL");
     replay.wait(LIMIT);
     let unlike = cluster.path().join("unlike");

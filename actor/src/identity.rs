@@ -22,9 +22,12 @@ impl Identity {
         Self { name: name.to_owned(), run_seed, writer: rand::random() }
     }
 
-    /// The only actor of a run, of the `start`th start of that run: the run's seed decides all its draws.
-    pub fn of_start(name: &str, run_seed: u64, start: u64) -> Self {
-        Self { name: name.to_owned(), run_seed, writer: start }
+    /// The only actor of a run, of the `start`th start of that run: the run's seed decides all its draws. Under a number
+    /// that `is_known` to the run's replay already, what it simulates would be taken for what is stored: the next that is
+    /// not known is taken.
+    pub fn of_start(name: &str, run_seed: u64, start: u64, is_known: impl Fn(u64) -> bool) -> Self {
+        let writer = (start..).find(|writer| !is_known(*writer)).expect("fewer writers than numbers");
+        Self { name: name.to_owned(), run_seed, writer }
     }
 
     /// The same actor as the `index`th of several replays knows it: two addresses of one replay are two writers to it.
@@ -73,6 +76,15 @@ mod tests {
             first(&Identity { writer: 2, ..identity.clone() }, 0, 0),
         ];
         assert!(others.iter().all(|other| *other != draw));
+    }
+
+    #[test]
+    fn the_only_actor_of_a_run_takes_the_number_of_its_start_or_the_next_that_is_free() {
+        let writer = |start, known: &[u64]| {
+            Identity::of_start("actor", 0, start, |writer| known.contains(&writer)).writer
+        };
+        assert_eq!(writer(3, &[1, 2]), 3);
+        assert_eq!(writer(1, &[1, 2]), 3, "the count of starts was lost");
     }
 
     #[test]

@@ -277,7 +277,8 @@ impl Trainer {
         }
         let mut batch = Batch::from_minibatch(&mut minibatch)?;
         batch.weight = minibatch.importance_weights(self.config.sac.importance_exponent as f32);
-        if self.progress.env_steps < self.config.sac.normalize_until {
+        // The first minibatch comes at some env steps more than the uniform ones: of it, statistics are made in any case.
+        if self.progress.env_steps < self.config.sac.normalize_until || !self.sac.is_trained() {
             self.sac.merge_statistics(&batch);
         }
         self.sac.anneal(self.progress.env_steps);

@@ -18,21 +18,23 @@ pub(super) const PRESETS: [(&str, &str); 5] = [
     ("gpu", include_str!("../presets/gpu.toml")),
 ];
 
-/// Environment variables with our prefix that are no settings: beginnings of their names. The last ones are of the cluster's
-/// compose files.
-const NOT_SETTINGS: [&str; 11] = [
-    "GETUP_TEST_",
-    "GETUP_PEERS_",
+/// Environment variables with our prefix that are no settings: the preset, and what the cluster's compose files are told.
+const NOT_SETTINGS: [&str; 12] = [
     PRESET_VARIABLE,
     "GETUP_IMAGE",
     "GETUP_TAG",
     "GETUP_SETTINGS",
     "GETUP_GRAFANA_PORT",
     "GETUP_PROMETHEUS_PORT",
-    "GETUP_REPLAY_",
-    "GETUP_LEARNER_",
-    "GETUP_ACTOR_",
+    "GETUP_REPLAY_CPUS",
+    "GETUP_REPLAY_MEMORY",
+    "GETUP_LEARNER_CPUS",
+    "GETUP_LEARNER_MEMORY",
+    "GETUP_ACTOR_CPUS",
+    "GETUP_ACTOR_MEMORY",
 ];
+/// How names of others begin: of the tests and benchmarks.
+const NO_SETTINGS: [&str; 2] = ["GETUP_TEST_", "GETUP_PEERS_"];
 /// Chooses the preset where the command line does not.
 pub(super) const PRESET_VARIABLE: &str = "GETUP_PRESET";
 
@@ -130,10 +132,9 @@ impl Layers {
     }
 }
 
-/// Whether a variable with our prefix is there for something else. In a setting's name the underscore after a table is
-/// doubled.
+/// Whether a variable with our prefix is there for something else.
 fn is_no_setting(name: &str) -> bool {
-    NOT_SETTINGS.iter().any(|other| name.strip_prefix(other).is_some_and(|rest| !rest.starts_with('_')))
+    NOT_SETTINGS.contains(&name) || NO_SETTINGS.iter().any(|beginning| name.starts_with(beginning))
 }
 
 /// `a.b = value` as tables.

@@ -42,7 +42,8 @@ pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Sta
     let trainer = make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, start)?;
     note_config(config, folder)?;
     let bar = Progress::start(role, config, Arc::clone(&hub));
-    let identity = Identity::of_start(&config.actor.name, config.seed, incarnation);
+    let identity =
+        Identity::of_start(&config.actor.name, config.seed, incarnation, |writer| store.knows(writer));
     let setup = crate::actor::setup(config, role, identity, folder.root().join("diverged"))?;
     let options = sample_options(config, incarnation);
     store.check_options(&options)?;

@@ -2,6 +2,7 @@
 
 use std::error::Error;
 use std::fmt;
+use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -218,9 +219,13 @@ impl Connector {
 
 /// The innermost error: "connection refused" says more than "tcp connect error".
 fn root_cause(error: &dyn Error) -> String {
-    let mut cause = error;
-    while let Some(source) = cause.source() {
-        cause = source;
+    let (mut said, mut cause) = (error.to_string(), error.source());
+    while let Some(source) = cause {
+        let failed = source.downcast_ref::<io::Error>();
+        if failed.is_some_and(|failed| failed.kind() == io::ErrorKind::TimedOut) {
+            return "it does not answer".to_owned();
+        }
+        (said, cause) = (source.to_string(), source.source());
     }
-    cause.to_string()
+    said
 }

@@ -22,19 +22,20 @@ impl Pace {
     /// Counts an update; true once in a while, when it is time to show something.
     pub(super) fn count(&mut self) -> bool {
         self.updates += 1;
-        let elapsed = self.window_start.elapsed();
-        if elapsed >= WINDOW {
-            self.per_second = (self.updates - self.window_updates) as f64 / elapsed.as_secs_f64();
-            (self.window_start, self.window_updates) = (Instant::now(), self.updates);
-        }
-        elapsed >= WINDOW || self.updates.is_multiple_of(100)
+        self.is_time_to_show() || self.updates.is_multiple_of(100)
     }
 
-    /// For whoever makes no updates: true once in a while.
+    fn close_window(&mut self) {
+        let elapsed = self.window_start.elapsed().as_secs_f64();
+        self.per_second = (self.updates - self.window_updates) as f64 / elapsed;
+        (self.window_start, self.window_updates) = (Instant::now(), self.updates);
+    }
+
+    /// For whoever makes no update now: true once in a while.
     pub(super) fn is_time_to_show(&mut self) -> bool {
         let is_time = self.window_start.elapsed() >= WINDOW;
         if is_time {
-            (self.window_start, self.window_updates, self.per_second) = (Instant::now(), self.updates, 0.0);
+            self.close_window();
         }
         is_time
     }

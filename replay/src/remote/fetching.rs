@@ -122,6 +122,7 @@ impl Fetching {
             Ok(response) => response.into_inner(),
             Err(status) => return self.end(status),
         };
+        self.admitted = true;
         // Taken since credits were last given.
         let mut free = 0;
         let mut asked_why = tokio::time::interval(REASON_TICK);
@@ -129,7 +130,6 @@ impl Fetching {
             tokio::select! {
                 message = inbound.message() => match message {
                     Ok(Some(reply)) => {
-                        self.admitted = true;
                         backoff.reset();
                         asked_why.reset();
                         // What was waited for has come.

@@ -135,6 +135,11 @@ impl Store {
         &self.spec
     }
 
+    /// Whether a writer ever stored anything here.
+    pub fn knows(&self, writer: u64) -> bool {
+        self.log().durable(writer) > 0
+    }
+
     /// Notes that a writer has come, under the name that logs and `status` show, and returns the greatest sequence
     /// number of it that is durable: it goes on from there. [`Store::farewell`] when it goes.
     pub fn introduce(&self, writer: u64, name: &str) -> u64 {
