@@ -34,7 +34,7 @@ const NOT_SETTINGS: [&str; 12] = [
     "GETUP_ACTOR_MEMORY",
 ];
 /// How names of others begin: of the tests and benchmarks.
-const NO_SETTINGS: [&str; 2] = ["GETUP_TEST_", "GETUP_PEERS_"];
+const OTHER_PREFIXES: [&str; 2] = ["GETUP_TEST_", "GETUP_PEERS_"];
 /// Chooses the preset where the command line does not.
 pub(super) const PRESET_VARIABLE: &str = "GETUP_PRESET";
 
@@ -134,7 +134,7 @@ impl Layers {
 
 /// Whether a variable with our prefix is there for something else.
 fn is_no_setting(name: &str) -> bool {
-    NOT_SETTINGS.contains(&name) || NO_SETTINGS.iter().any(|beginning| name.starts_with(beginning))
+    NOT_SETTINGS.contains(&name) || OTHER_PREFIXES.iter().any(|beginning| name.starts_with(beginning))
 }
 
 /// `a.b = value` as tables.
