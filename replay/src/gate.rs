@@ -241,10 +241,7 @@ impl Gate {
 
     /// What the longest wait of this store waits for; empty where nobody waits.
     pub(crate) fn waiting(&self) -> String {
-        let mut waits = self.waits.current().into_iter();
-        waits
-            .find(|wait| matches!(wait.what, "sampler" | "writer" | "replay"))
-            .map_or_else(String::new, |wait| wait.to_string())
+        self.waits.current().first().map_or_else(String::new, ToString::to_string)
     }
 
     fn explain(&self, wait: &mut Waiting, what: &'static str, reason: impl FnOnce() -> String) {

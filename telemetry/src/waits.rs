@@ -40,6 +40,8 @@ impl fmt::Display for Wait {
 #[derive(Clone, Debug)]
 pub struct Waits {
     table: Arc<Mutex<Table>>,
+    /// Of a part of the process, which sees its own alone.
+    part: Option<u64>,
 }
 
 /// A wait that ends when this is dropped.
@@ -56,7 +58,7 @@ impl Waits {
     /// # Panics
     /// When `registry` has such a gauge already: a process has one table, and its roles share it.
     pub fn new(registry: &Registry) -> Self {
-        let waits = Self { table: Arc::default() };
+        let waits = Self { table: Arc::default(), part: None };
         let gauge = WaitGauge::new(&waits);
         registry.register(Box::new(gauge)).expect("a registry has one table of waits");
         let table = Arc::downgrade(&waits.table);
@@ -67,15 +69,20 @@ impl Waits {
         waits
     }
 
+    /// For one part of the process among several alike: its waits are the process's too, and it sees no others.
+    pub fn part(&self) -> Self {
+        Self { part: Some(self.table().new_id()), ..self.clone() }
+    }
+
     /// Notes that `what` waits for `reason`, until the guard is dropped.
     pub fn begin(&self, what: &'static str, reason: String) -> WaitGuard {
-        let id = self.table().begin(Instant::now(), what, reason);
+        let id = self.table().begin(Instant::now(), self.part, what, reason);
         WaitGuard { waits: self.clone(), id }
     }
 
     /// What is waited for now, the longest wait first.
     pub fn current(&self) -> Vec<Wait> {
-        self.table().current(Instant::now())
+        self.table().current(Instant::now(), self.part)
     }
 
     fn table(&self) -> MutexGuard<'_, Table> {
@@ -112,6 +119,7 @@ struct Table {
 #[derive(Debug)]
 struct Entry {
     id: u64,
+    part: Option<u64>,
     what: &'static str,
     reason: String,
     since: Instant,
@@ -127,19 +135,26 @@ impl Entry {
 }
 
 impl Table {
-    fn begin(&mut self, now: Instant, what: &'static str, reason: String) -> u64 {
+    fn new_id(&mut self) -> u64 {
         self.last_id += 1;
-        self.known.insert(what);
-        self.entries.push(Entry { id: self.last_id, what, reason, since: now, next_log: FIRST_LOG });
         self.last_id
+    }
+
+    fn begin(&mut self, now: Instant, part: Option<u64>, what: &'static str, reason: String) -> u64 {
+        let id = self.new_id();
+        self.known.insert(what);
+        self.entries.push(Entry { id, part, what, reason, since: now, next_log: FIRST_LOG });
+        id
     }
 
     fn end(&mut self, id: u64) {
         self.entries.retain(|entry| entry.id != id);
     }
 
-    fn current(&self, now: Instant) -> Vec<Wait> {
-        self.entries.iter().map(|entry| entry.wait(now)).collect()
+    /// Of one part, or of all.
+    fn current(&self, now: Instant, part: Option<u64>) -> Vec<Wait> {
+        let asked = self.entries.iter().filter(|entry| part.is_none() || entry.part == part);
+        asked.map(|entry| entry.wait(now)).collect()
     }
 
     /// The waits to log now, each of which is then due again at twice its length.
@@ -161,7 +176,7 @@ fn log_long_waits(table: &Weak<Mutex<Table>>) {
         thread::sleep(TICK);
         let Some(table) = table.upgrade() else { return };
         // Not under the lock: whoever reads the log may be slow.
-        let due = Waits { table }.table().due(Instant::now());
+        let due = Waits { table, part: None }.table().due(Instant::now());
         for wait in due {
             tracing::info!(what = wait.what, seconds = wait.seconds, "{wait}");
         }
@@ -189,7 +204,7 @@ impl Collector for WaitGauge {
 
     fn collect(&self) -> Vec<MetricFamily> {
         if let Some(table) = self.table.upgrade() {
-            let waits = Waits { table };
+            let waits = Waits { table, part: None };
             for what in &waits.table().known {
                 self.seconds.with_label_values(&[what]).set(0.0);
             }
@@ -209,7 +224,7 @@ mod tests {
     fn a_wait_is_logged_after_5_seconds_and_then_each_time_its_length_has_doubled() {
         let mut table = Table::default();
         let start = Instant::now();
-        let id = table.begin(start, "actor", "no policy yet".into());
+        let id = table.begin(start, None, "actor", "no policy yet".into());
         let logged: Vec<u64> =
             (0..100).filter(|second| !table.due(start + Duration::from_secs(*second)).is_empty()).collect();
         assert_eq!(logged, [5, 10, 20, 40, 80]);
@@ -229,6 +244,16 @@ mod tests {
         assert_eq!(waits.current()[0].what, "sampler");
         drop(second);
         assert!(waits.current().is_empty());
+    }
+
+    #[test]
+    fn a_part_sees_its_own_waits_and_the_process_sees_all() {
+        let process = Waits::new(&Registry::new());
+        let (first, second) = (process.part(), process.part());
+        let _own = first.clone().begin("sampler", "812 of 1,000 transitions".into());
+        let _whole = process.begin("learner", "no replay".into());
+        assert_eq!((process.current().len(), first.current().len(), second.current().len()), (2, 1, 0));
+        assert_eq!(first.current()[0].what, "sampler");
     }
 
     #[test]

@@ -6,8 +6,8 @@ use getup_proto::v1::append_request::Message;
 use getup_proto::v1::replay_client::ReplayClient;
 use getup_proto::{RunSpec, v1};
 use getup_replay::{
-    ItemSelector, Minibatch, MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, Sampler, Store,
-    TableError, Tables, describe, describe_table, serve, update_priorities,
+    ItemSelector, Minibatch, MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, ReplayMetrics,
+    Sampler, Store, TableError, Tables, describe, describe_table, serve, update_priorities,
 };
 use getup_telemetry::{Registry, Shutdown, Waits};
 use std::sync::Arc;
@@ -198,8 +198,10 @@ fn keys_are_the_same_after_a_restart_and_after_evictions() {
 #[test]
 fn tables_of_one_service_know_nothing_of_each_other() {
     let (default, other) = (TempDir::new().unwrap(), TempDir::new().unwrap());
+    let process = Waits::new(&Registry::new());
     let store = |dir: &TempDir, spec: &RunSpec, settings: &ReplayConfig| {
-        Arc::new(open(dir.path(), spec, settings).unwrap())
+        let metrics = ReplayMetrics::new(&Registry::new());
+        Arc::new(Store::open(dir.path(), spec, settings, metrics, process.clone()).unwrap())
     };
     // Of another spec, sampler and limit.
     let queue = ReplayConfig { sampler: ItemSelector::Fifo, max_times_sampled: Some(1), ..config() };
@@ -254,6 +256,11 @@ fn tables_of_one_service_know_nothing_of_each_other() {
     assert_eq!(taken, (0..64).collect::<Vec<_>>());
     assert!(source.poll(Duration::from_millis(50)).unwrap().is_none());
     assert_eq!((plain.counters().sampled, queue.counters().sampled), (0, 64));
+
+    let waiting =
+        |table| runtime.block_on(describe_table(&endpoint, table)).unwrap().limiter.unwrap().waiting;
+    eventually("the queue's sampler waits", || waiting("queue").starts_with("sampler waits"));
+    assert_eq!(waiting("default"), "");
     shutdown.trigger();
     runtime.block_on(serving).unwrap().unwrap();
 }
