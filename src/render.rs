@@ -93,8 +93,10 @@ fn play(actor: &Actor, seed: u64) -> Result<(EvaluatedEpisode, Vec<Vec<f64>>)> {
     let seeds = unseen_falls(seed, 1);
     let (mut episodes, mut file) =
         evaluator.record(&actor.policy, actor.beta, &seeds, |_| ControlFlow::Continue(()))?;
-    let (Some(episode), Some(rollout)) = (episodes.pop(), file.rollouts.pop()) else {
-        bail!("the evaluation of one fall gave none");
+    let episode = episodes.pop().context("an evaluation of one fall has one episode")?;
+    let Some(rollout) = file.rollouts.pop() else {
+        let cause = episode.diverged.unwrap_or_default();
+        bail!("the simulation of fall {seed} failed ({cause}): take another --seed");
     };
     let poses = [vec![rollout.qpos0], rollout.qpos].concat();
     Ok((episode, poses))

@@ -23,15 +23,20 @@ pub const STAND_STEPS: usize = 100;
 pub struct EvaluatedEpisode {
     /// What determined the fall.
     pub seed: u64,
-    /// Sum of the rewards. Where the simulation diverged, of those before it did.
+    /// Sum of the rewards; 0 where the simulation diverged, of which nothing is known.
     pub episode_return: f64,
     /// Height of the head after each control step, in metres.
     pub head_heights: Vec<f64>,
-    /// Why the simulation failed, where it did; the episode ends there.
+    /// Why the simulation failed, where it did, in the fall or after it; the episode ends there.
     pub diverged: Option<String>,
 }
 
 impl EvaluatedEpisode {
+    /// Whose simulation failed.
+    fn failed(seed: u64, cause: String) -> Self {
+        Self { seed, episode_return: 0.0, head_heights: Vec::new(), diverged: Some(cause) }
+    }
+
     /// The highest that the head was, in metres.
     pub fn max_head_height(&self) -> f64 {
         self.head_heights.iter().copied().fold(0.0, f64::max)
@@ -42,9 +47,9 @@ impl EvaluatedEpisode {
         self.head_heights.last().copied().unwrap_or(0.0)
     }
 
-    /// Whether the head was up at any step.
+    /// Whether the head was up at any step of a whole episode.
     pub fn rises(&self) -> bool {
-        self.max_head_height() >= UP_HEIGHT
+        self.diverged.is_none() && self.max_head_height() >= UP_HEIGHT
     }
 
     /// Whether the head was up through the last [`STAND_STEPS`] steps of a whole episode.
@@ -88,14 +93,6 @@ pub enum EvaluateError {
         /// The clamp.
         limit: f64,
     },
-    /// The limp fall itself diverged.
-    #[error("the fall of seed {seed} failed: {cause}; use another seed")]
-    Fall {
-        /// Of the fall.
-        seed: u64,
-        /// What went wrong.
-        cause: String,
-    },
     /// Whoever watched its progress ended it.
     #[error("the evaluation was ended before it was complete")]
     Ended,
@@ -105,8 +102,11 @@ pub enum EvaluateError {
 pub struct Evaluator {
     task: Arc<GetUp>,
     players: Vec<Player>,
-    landed: HashMap<u64, Arc<Landed>>,
+    landed: HashMap<u64, Fall>,
 }
+
+/// Where a fall ended, or why its simulation failed.
+type Fall = Result<Arc<Landed>, String>;
 
 /// Where a fall ended.
 struct Landed {
@@ -208,7 +208,10 @@ impl Evaluator {
             if progress(done).is_break() {
                 return Err(EvaluateError::Ended);
             }
-            self.seat(&mut waiting, beta, record)?;
+            for (index, failed) in self.seat(&mut waiting, beta, record) {
+                played[index] = Some((failed, None));
+                done += 1;
+            }
             batch.clear();
             for player in self.players.iter().filter(|player| player.playing.is_some()) {
                 batch.extend_from_slice(&player.observation);
@@ -240,26 +243,27 @@ impl Evaluator {
         Ok(())
     }
 
-    /// Gives every free lane the next seed.
+    /// Gives every free lane the next seed, and returns the episodes that end before they begin: their falls failed.
     fn seat(
         &mut self,
         waiting: &mut impl Iterator<Item = (usize, u64)>,
         beta: f64,
         record: bool,
-    ) -> Result<(), EvaluateError> {
+    ) -> Vec<(usize, EvaluatedEpisode)> {
+        let mut failed = Vec::new();
         for player in self.players.iter_mut().filter(|player| player.playing.is_none()) {
-            let Some((index, seed)) = waiting.next() else { return Ok(()) };
-            let landed = match self.landed.get(&seed) {
-                Some(landed) => landed.clone(),
-                None => {
-                    let landed = Arc::new(player.fall(seed)?);
-                    self.landed.insert(seed, landed.clone());
-                    landed
+            for (index, seed) in waiting.by_ref() {
+                let fall = self.landed.entry(seed).or_insert_with(|| player.fall(seed));
+                match fall {
+                    Ok(landed) => {
+                        player.begin(index, seed, landed, beta, record);
+                        break;
+                    }
+                    Err(cause) => failed.push((index, EvaluatedEpisode::failed(seed, cause.clone()))),
                 }
-            };
-            player.begin(index, seed, &landed, beta, record);
+            }
         }
-        Ok(())
+        failed
     }
 }
 
@@ -271,14 +275,14 @@ impl Player {
     }
 
     /// Plays the fall that `seed` determines.
-    fn fall(&mut self, seed: u64) -> Result<Landed, EvaluateError> {
+    fn fall(&mut self, seed: u64) -> Fall {
         self.lane.begin(seed, 1.0);
         while self.lane.phase() == Phase::Limp {
             self.lane.limp_action(&mut self.action);
             let step = self.lane.step(&self.action);
-            step.map_err(|diverged| EvaluateError::Fall { seed, cause: diverged.cause.to_string() })?;
+            step.map_err(|diverged| format!("the fall: {}", diverged.cause))?;
         }
-        Ok(Landed { qpos: self.lane.qpos().to_vec(), qvel: self.lane.qvel().to_vec() })
+        Ok(Arc::new(Landed { qpos: self.lane.qpos().to_vec(), qvel: self.lane.qvel().to_vec() }))
     }
 
     fn begin(&mut self, index: usize, seed: u64, landed: &Landed, beta: f64, record: bool) {
@@ -320,7 +324,10 @@ impl Player {
             }
             Err(diverged) => {
                 let cause = diverged.cause.to_string();
-                episode.diverged = Some(cause.clone());
+                *episode = EvaluatedEpisode {
+                    head_heights: std::mem::take(&mut episode.head_heights),
+                    ..EvaluatedEpisode::failed(episode.seed, cause.clone())
+                };
                 if let Some(rollout) = rollout {
                     rollout.diverged = Some(DivergedAt { step: diverged.step, cause });
                 }

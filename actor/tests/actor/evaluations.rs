@@ -35,6 +35,20 @@ fn the_result_is_the_same_bit_for_bit_on_any_number_of_lanes_and_when_repeated()
 }
 
 #[test]
+fn a_diverged_episode_earns_nothing_and_the_evaluation_goes_on() {
+    // Torques that no physics step of 5 ms survives.
+    let mut evaluator = Evaluator::new(&TaskConfig::default(), 1e5, 2).unwrap();
+    let episodes = evaluator.evaluate(&policy(1), 1e5, &SEEDS, watch).unwrap();
+    assert_eq!(episodes.len(), SEEDS.len());
+    let (failed, whole): (Vec<_>, Vec<_>) = episodes.iter().partition(|episode| episode.diverged.is_some());
+    assert!(!failed.is_empty() && whole.iter().all(|episode| episode.head_heights.len() == 250));
+    for episode in failed {
+        let result = episode.result();
+        assert_eq!((result.episode_return, result.rises, result.stands), (0.0, false, false));
+    }
+}
+
+#[test]
 fn no_training_setting_softens_an_evaluation() {
     let soft = TaskConfig {
         ragdoll_steps: 0,
