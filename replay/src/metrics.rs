@@ -13,6 +13,8 @@ use getup_telemetry::prometheus::{
 pub struct ReplayMetrics {
     pub(crate) transitions: IntGauge,
     pub(crate) capacity: IntGauge,
+    pub(crate) log_transitions: IntGauge,
+    pub(crate) log_capacity: IntGauge,
     pub(crate) memory_bytes: IntGauge,
     pub(crate) disk: Disk,
     pub(crate) inserted_env_steps: IntCounter,
@@ -68,6 +70,11 @@ impl ReplayMetrics {
         Self {
             transitions: gauge("transitions", "Transitions that can be sampled now."),
             capacity: gauge("capacity_transitions", "Transitions that fit."),
+            log_transitions: gauge("log_transitions", "Transitions in the log, on disk."),
+            log_capacity: gauge(
+                "log_capacity_transitions",
+                "Transitions that the log keeps: those that fit, times the window of a remover that has one.",
+            ),
             memory_bytes: gauge("memory_bytes", "Memory of a full ring."),
             disk: added(registry, Disk::new(table)),
             inserted_env_steps: counter("env_steps_total", "Env steps ever stored."),

@@ -287,9 +287,14 @@ impl Log {
         Ok(())
     }
 
+    /// Transitions in the log's files.
+    pub(crate) fn held(&self) -> u64 {
+        self.files.iter().map(|file| file.transitions).sum()
+    }
+
     /// How many of the oldest files can go.
     fn excess(&self) -> usize {
-        let mut held: u64 = self.files.iter().map(|file| file.transitions).sum();
+        let mut held = self.held();
         let fits = |file: &&Held| {
             held -= file.transitions;
             held >= self.kept

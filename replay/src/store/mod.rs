@@ -78,6 +78,8 @@ impl Store {
         spec.validate()?;
         config.validate_for(spec)?;
         let started = Instant::now();
+        // Other tables of the process wait for their own reasons.
+        let waits = waits.part();
         let mut ring = Ring::new(spec, config);
         let log = Log::open(dir, spec, config, |segment| ring.push(segment))?;
         let (state, sampled) = (log.state(), log.watermark().sampled()?);
@@ -97,6 +99,8 @@ impl Store {
         metrics.begin_at(&state, sampled);
         metrics.transitions.set(ring.len() as i64);
         metrics.capacity.set(config.capacity as i64);
+        metrics.log_transitions.set(log.held() as i64);
+        metrics.log_capacity.set(config.kept() as i64);
         metrics.memory_bytes.set(ring.memory_bytes() as i64);
         metrics.disk.watch(dir);
         if let Some((_, min, max)) = limiter.band() {
@@ -254,6 +258,7 @@ impl Store {
         let fresh: Vec<&Segment> =
             segments.iter().zip(new).filter_map(|(segment, new)| new.then_some(segment)).collect();
         let state = log.state();
+        self.metrics.log_transitions.set(log.held() as i64);
         {
             let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
             for segment in &fresh {
