@@ -5,8 +5,12 @@ use std::path::PathBuf;
 use anyhow::{Context, Result, ensure};
 use getup_policy::{MeanError, Policy};
 
+use crate::output::write_file;
+
 /// What an evaluation said of one of them it did not say of their mean.
 const OF_ONE: &str = "evaluation_";
+/// What their mean is played with, and they have to have in common.
+const OF_ALL: [&str; 3] = ["beta", "character", "physics_hz"];
 
 /// Average the weights of models of one ancestor into one model.
 ///
@@ -25,20 +29,36 @@ pub(crate) struct Args {
 pub(crate) fn run(arguments: Args) -> Result<()> {
     let load = |path: &PathBuf| Policy::load(path).with_context(|| path.display().to_string());
     let policies: Vec<Policy> = arguments.models.iter().map(load).collect::<Result<_>>()?;
+    let first = &policies[0].metadata;
+    for (path, policy) in arguments.models.iter().zip(&policies) {
+        for key in OF_ALL {
+            let named = |value: Option<&String>| value.map_or_else(|| "not said".to_owned(), String::clone);
+            let (own, others) = (named(policy.metadata.get(key)), named(first.get(key)));
+            ensure!(
+                own == others,
+                "{}: its {key} is {own}, and that of {} is {others}: average models of one {key}",
+                path.display(),
+                arguments.models[0].display()
+            );
+        }
+    }
     let mut mean = Policy::mean(&policies).map_err(|error| match error {
         MeanError::Differs { index, .. } => {
             anyhow::Error::new(error).context(arguments.models[index].display().to_string())
         }
         MeanError::None => error.into(),
     })?;
-    mean.metadata.retain(|key, _| !key.starts_with(OF_ONE));
+    let common = |key: &str, value: &str| {
+        policies.iter().all(|policy| policy.metadata.get(key).is_some_and(|own| own == value))
+    };
+    mean.metadata.retain(|key, value| !key.starts_with(OF_ONE) && common(key, value));
     mean.metadata.insert("average_of".into(), policies.len().to_string());
     let shown = arguments.output.display();
     ensure!(
         !arguments.models.contains(&arguments.output),
         "--output {shown} is one of the models: name another"
     );
-    mean.save(&arguments.output)?;
+    write_file(&arguments.output, mean.to_bytes())?;
     println!("The mean of {} models is in {shown}. Try it: getup evaluate {shown}", policies.len());
     Ok(())
 }

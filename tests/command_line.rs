@@ -162,7 +162,15 @@ fn models_of_one_ancestor_are_averaged_into_one_that_is_evaluated() {
 
     let wider = ["--run", "wider", "--steps", "600", "--set", "sac.hidden=[8, 8]"];
     succeed(&mut train(folder.path(), &wider));
+    let weaker = ["--run", "weaker", "--from", "a/models/last.safetensors", "--steps", "1"];
+    let fixed = ["--set", "curriculum.fixed=true", "--set", "curriculum.beta_start=0.5"];
+    succeed(train(folder.path(), &weaker).args(fixed));
     for (models, output, expected) in [
+        (
+            vec![b, "weaker/models/last.safetensors"],
+            "m.safetensors",
+            "weaker/models/last.safetensors: its beta is 0.5, and that of",
+        ),
         (
             vec![b, "wider/models/last.safetensors"],
             "m.safetensors",
