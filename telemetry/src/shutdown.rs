@@ -30,18 +30,19 @@ impl Shutdown {
         let mut interrupt = signal(SignalKind::interrupt())?;
         let shutdown = self.clone();
         tokio::spawn(async move {
-            loop {
-                let name = tokio::select! {
+            let mut next = async || {
+                tokio::select! {
                     _ = terminate.recv() => "SIGTERM",
                     _ = interrupt.recv() => "SIGINT",
-                };
-                if shutdown.is_triggered() {
-                    tracing::warn!("{name} during shutdown: ending at once");
-                    std::process::exit(INTERRUPTED);
                 }
-                tracing::info!("{name}: shutting down");
-                shutdown.trigger();
-            }
+            };
+            // The first may come when the end has begun by itself: it asks for nothing else.
+            let first = next().await;
+            tracing::info!("{first}: shutting down");
+            shutdown.trigger();
+            let second = next().await;
+            tracing::warn!("{second} during shutdown: ending at once");
+            std::process::exit(INTERRUPTED);
         });
         Ok(())
     }
