@@ -216,8 +216,8 @@ fn publish(run: &Run, folder: &Path) -> Result<()> {
 
 /// Env steps of the last line of `evaluations.jsonl`; none where there is no line, or half a line.
 fn last_env_steps(evaluations: &str) -> Option<u64> {
-    let (_, rest) = evaluations.lines().last()?.split_once("\"env_steps\":")?;
-    rest.split_once(',')?.0.trim().parse().ok()
+    let last: serde_json::Value = serde_json::from_str(evaluations.lines().last()?).ok()?;
+    last["env_steps"].as_u64()
 }
 
 /// Ctrl-C reaches the runs from the terminal, and they save; this process waits for them, and begins no other.
@@ -240,7 +240,9 @@ mod tests {
                      {\"version\":\"1.92\",\"env_steps\":600030,\"mean\":61.0}\n";
         assert_eq!(last_env_steps(lines), Some(600_030));
         assert_eq!(last_env_steps(""), None);
-        assert_eq!(last_env_steps("{\"version\":\"1.0\",\"env_st"), None);
+        for cut in ["{\"version\":\"1.0\",\"env_st", "{\"version\":\"1.0\",\"env_steps\":600030,\"up"] {
+            assert_eq!(last_env_steps(cut), None);
+        }
     }
 
     #[test]

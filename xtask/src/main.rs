@@ -26,7 +26,7 @@ struct Cli {
 enum Command {
     /// Install what is missing: MuJoCo and libtorch into `.native/`, Debian packages of the tests.
     Setup {
-        /// Also the peers that benchmarks compare with (PyTorch with its dependencies).
+        /// Also the peers that benchmarks compare with (PyTorch, and Reverb with TensorFlow: Python 3.11).
         #[arg(long)]
         peers: bool,
         /// Also the CUDA libraries that `--device cuda` needs (about 4 GB).

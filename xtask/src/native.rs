@@ -84,20 +84,29 @@ pub(crate) fn plots_python() -> PathBuf {
     native().join("plots/bin/python")
 }
 
-/// Installs the wheels and writes `.cargo/native.toml`, where they are missing or of other versions. Without `cuda`
-/// an installation with CUDA's libraries is left as it is.
+/// Installs the wheels and writes `.cargo/native.toml`, where they are missing or of other versions. An installation with
+/// CUDA's libraries keeps them, whether `cuda` asks for them or not.
 pub(crate) fn set_up(cuda: bool) -> Result<()> {
     prerequisites::check()?;
     let with_cuda = [WHEELS, CUDA_WHEELS].concat();
     let installed = fs::read_to_string(native().join("wheels/installed")).unwrap_or_default();
-    let has_cuda = installed == with_cuda.join("\n");
-    if !has_cuda && cuda {
-        install_wheels(&with_cuda, "MuJoCo and libtorch with CUDA (about 4 GB)")?;
-    } else if !has_cuda && installed != WHEELS.join("\n") {
-        install_wheels(WHEELS, "MuJoCo and libtorch (1.3 GB)")?;
+    let had_cuda =
+        CUDA_WHEELS.iter().any(|wheel| installed.lines().any(|line| package(line) == package(wheel)));
+    let (wheels, what) = if cuda || had_cuda {
+        (&with_cuda[..], "MuJoCo and libtorch with CUDA (about 4 GB)")
+    } else {
+        (WHEELS, "MuJoCo and libtorch (1.3 GB)")
+    };
+    if installed != wheels.join("\n") {
+        install_wheels(wheels, what)?;
     }
     link_mujoco()?;
     write_cargo_settings()
+}
+
+/// The package of a requirement such as `numpy==2.3.5`.
+fn package(requirement: &str) -> &str {
+    requirement.split_once("==").map_or(requirement, |(package, _)| package)
 }
 
 /// Makes the environment that the benchmarks' peers run in.
@@ -186,7 +195,7 @@ fn link_mujoco() -> Result<()> {
     if fs::read_link(&link).is_ok_and(|old| old == target) {
         return Ok(());
     }
-    fs::create_dir_all(&folder)?;
+    fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
     // Not there, or the link of another place.
     let _ = fs::remove_file(&link);
     #[cfg(unix)]

@@ -1,5 +1,6 @@
 //! Train, test, check, bench: each a few cargo commands, all on the release profile, so that they share artefacts.
 
+use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
 use std::process::Command;
 
@@ -10,7 +11,8 @@ use crate::native::{self, peers_python, readers_python, reverb_python, root, run
 /// Cargo, in the root of the repository.
 pub(crate) fn cargo() -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    command.current_dir(root());
+    // Where what is built is looked for, whatever the user's own settings say.
+    command.current_dir(root()).env("CARGO_TARGET_DIR", root().join("target"));
     // Cargo gave this process the paths that held before it wrote them anew: let the next one read the file.
     for (name, _) in native::BUILD_VARIABLES {
         command.env_remove(name);
@@ -28,13 +30,7 @@ pub(crate) fn build() -> Result<PathBuf> {
 pub(crate) fn train(arguments: &[String]) -> Result<()> {
     let mut command = Command::new(build()?);
     command.arg("train").args(arguments);
-    #[cfg(unix)]
-    {
-        use std::os::unix::process::CommandExt;
-        Err(command.exec()).context("cannot start getup")
-    }
-    #[cfg(not(unix))]
-    run(&mut command)
+    Err(command.exec()).context("cannot start getup")
 }
 
 /// The tests; `full` adds the long forms, which read `GETUP_TEST_FULL`.
