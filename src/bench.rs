@@ -183,8 +183,9 @@ impl Bench {
         for replay in &self.replays {
             let described = timeout(PATIENCE, getup_replay::describe(replay.clone())).await;
             let described = described.map_err(|_| self.unanswered("the replay does not answer", PATIENCE))?;
-            let described =
-                described.map_err(|status| anyhow::anyhow!("{}: {}", replay.address, status.message()))?;
+            let described = described.map_err(|status| {
+                anyhow::anyhow!("{}: {}", replay.address, getup_transport::reason(&status))
+            })?;
             ensure!(
                 described.tables.contains(&self.table),
                 "the replay at {} has no table `{}` but {}: `getup bench --help` says how it gets one",

@@ -75,7 +75,7 @@ async fn ask_learner(endpoint: Endpoint) -> Result<v1::StatusReply> {
 }
 
 fn unanswered(address: &str, status: &Status) -> anyhow::Error {
-    anyhow!("{address}: {}", status.message())
+    anyhow!("{address}: {}", getup_transport::reason(status))
 }
 
 fn version(version: Option<v1::PolicyVersion>) -> String {

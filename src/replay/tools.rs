@@ -269,7 +269,8 @@ async fn snapshot(name: &str, table: &str, config: &ConfigArgs, json: bool) -> R
 async fn snapshot_of(endpoint: &Endpoint, name: &str, table: &str, json: bool) -> Result<()> {
     let address = &endpoint.address;
     let taken = getup_replay::take_snapshot(endpoint.clone(), table, name).await;
-    let taken = taken.map_err(|status| anyhow::anyhow!("replay at {address}: {}", status.message()))?;
+    let taken = taken
+        .map_err(|status| anyhow::anyhow!("replay at {address}: {}", getup_transport::reason(&status)))?;
     let transitions = taken.counters.unwrap_or_default().transitions;
     if json {
         let (paused, seconds) = (taken.paused_seconds, taken.seconds);

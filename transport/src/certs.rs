@@ -136,6 +136,7 @@ impl Authority {
             let certificate = File { setting: "ca", path: certificate, bytes };
             return Ok(Self { key, certificate, is_new: false });
         }
+        let is_new = key.is_none();
         let key = match key {
             Some(key) => parse_key(&key_file, &key)?,
             None => {
@@ -146,7 +147,7 @@ impl Authority {
         };
         let bytes = params().self_signed(&key)?.pem().into_bytes();
         write(dir, "ca.pem", &bytes, 0o644)?;
-        Ok(Self { key, certificate: File { setting: "ca", path: certificate, bytes }, is_new: true })
+        Ok(Self { key, certificate: File { setting: "ca", path: certificate, bytes }, is_new })
     }
 }
 

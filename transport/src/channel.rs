@@ -43,8 +43,6 @@ pub struct ChannelOptions {
     pub keep_alive_while_idle: bool,
     /// How much the peer may send ahead of what is read.
     pub window: Window,
-    /// Whether small messages are sent at once.
-    pub tcp_nodelay: bool,
 }
 
 impl Default for ChannelOptions {
@@ -55,7 +53,6 @@ impl Default for ChannelOptions {
             keep_alive_timeout: Duration::from_secs(5),
             keep_alive_while_idle: true,
             window: Window::Adaptive,
-            tcp_nodelay: true,
         }
     }
 }
@@ -115,6 +112,9 @@ impl Credentials {
             "https" => return Err(refused("TLS wants security.ca, security.certificate and security.key")),
             _ => return Err(refused("its scheme is neither http nor https")),
         }
+        if authority.contains(['@', '#']) {
+            return Err(refused("it is a host and a port, and nothing else"));
+        }
         let scheme = if self.tls.is_some() { "https" } else { "http" };
         let uri: Uri = format!("{scheme}://{}", authority.strip_suffix('/').unwrap_or(authority))
             .parse()
@@ -129,7 +129,7 @@ impl Credentials {
             .map_err(|_| refused("its host is neither a name nor an IP address"))?;
         let mut http = HttpConnector::new();
         http.enforce_http(false);
-        http.set_nodelay(options.tcp_nodelay);
+        http.set_nodelay(true);
         // Shared by the addresses of a name, within the patience for all of it: a dead one leaves time for the next.
         http.set_connect_timeout(Some(options.connect_timeout.mul_f64(0.7)));
         let (network, tls) = (network.clone(), self.tls.clone());
@@ -214,6 +214,15 @@ impl Connector {
             format!("no TLS with {place}: {error}; are the certificates of both ends from one authority?")
         })?;
         Ok(TokioIo::new(Either::Right(stream)))
+    }
+}
+
+/// What a call's status says. Where the connection broke, tonic says so and keeps the reason to itself: this says the
+/// reason, such as a certificate that the peer refused.
+pub fn reason(status: &Status) -> String {
+    match status.source() {
+        Some(cause) => format!("{}: {}", status.message(), root_cause(cause)),
+        None => status.message().to_owned(),
     }
 }
 

@@ -3,6 +3,7 @@
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
+use documented::DocumentedFieldsOpt;
 use serde::{Deserialize, Serialize};
 
 use crate::SecurityError;
@@ -10,7 +11,7 @@ use crate::SecurityError;
 /// `[security]`: who may reach a role's ports. An empty path is none.
 ///
 /// A token alone keeps strangers out of a network where nobody listens in; mutual TLS does so in any network.
-#[derive(Clone, PartialEq, Eq, Debug, Default, Serialize, Deserialize)]
+#[derive(Clone, PartialEq, Eq, Debug, Default, Serialize, Deserialize, DocumentedFieldsOpt)]
 #[serde(default, deny_unknown_fields)]
 pub struct SecurityConfig {
     /// A file of tokens, one a line: the first is sent, and each is accepted, so that a new one can be brought in

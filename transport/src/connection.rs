@@ -63,7 +63,8 @@ impl<S> Connection<S> {
         Self { stream, peer, deadline, metrics, _seat: seat }
     }
 
-    /// Fails once the deadline has passed and no call was let in.
+    /// Fails once the deadline has passed and no call was let in. Reads and writes both ask: while something cannot be
+    /// written, nothing is read.
     fn check_deadline(&mut self, context: &mut Context<'_>) -> io::Result<()> {
         let Some(deadline) = &mut self.deadline else { return Ok(()) };
         if deadline.as_mut().poll(context).is_pending() {
@@ -103,6 +104,7 @@ impl<S: network::Stream> AsyncWrite for Connection<S> {
         context: &mut Context<'_>,
         bytes: &[u8],
     ) -> Poll<io::Result<usize>> {
+        self.check_deadline(context)?;
         Pin::new(&mut self.stream).poll_write(context, bytes)
     }
 
@@ -111,6 +113,7 @@ impl<S: network::Stream> AsyncWrite for Connection<S> {
         context: &mut Context<'_>,
         slices: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
+        self.check_deadline(context)?;
         Pin::new(&mut self.stream).poll_write_vectored(context, slices)
     }
 
@@ -119,6 +122,7 @@ impl<S: network::Stream> AsyncWrite for Connection<S> {
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.check_deadline(context)?;
         Pin::new(&mut self.stream).poll_flush(context)
     }
 

@@ -14,7 +14,7 @@
 //! | [`network`] | [`Listener`] and [`Network`]: TCP, or what a simulation puts in its place |
 //! | [`server`] | [`Server`]: a port with TLS, token and [`Limits`] in front of its services |
 //! | [`metrics`] | [`Metrics`]: connections, and those that were refused |
-//! | [`token`] | [`generate_token`], and [`authorized`] for ports that are not gRPC |
+//! | [`token`] | [`generate_token`]: a secret that whoever calls has to know |
 //! | [`certs`] | [`make_authority`]: certificates for a cluster that has no authority of its own |
 
 pub mod certs;
@@ -35,7 +35,7 @@ mod tls;
 pub mod token;
 
 pub use certs::{CertsError, Issued, make_authority};
-pub use channel::{Bearer, Channel, ChannelOptions, Window};
+pub use channel::{Bearer, Channel, ChannelOptions, Window, reason};
 pub use config::{SecurityConfig, require_protection};
 pub use credentials::Credentials;
 pub use endpoint::Endpoint;
@@ -43,4 +43,4 @@ pub use error::{AddressError, SecurityError};
 pub use metrics::Metrics;
 pub use network::{Listener, Network};
 pub use server::{Limits, Server};
-pub use token::{authorized, generate_token};
+pub use token::generate_token;

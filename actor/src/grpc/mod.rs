@@ -18,9 +18,9 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// What a status means for the actor: whether another attempt is worth while. `admitted`: whether the peer has let it in
 /// before. Then a token that it does not know is one that reaches the two of them at different times.
 fn link_error(peer: &str, status: &Status, admitted: bool) -> LinkError {
-    let said = match status.message() {
+    let said = match &*getup_transport::reason(status) {
         "" => format!("{peer}: {}", status.code()),
-        message => format!("{peer}: {message}"),
+        reason => format!("{peer}: {reason}"),
     };
     match status.code() {
         Code::Unauthenticated if admitted => LinkError::Unavailable(said),

@@ -78,6 +78,5 @@ pub(super) fn channel(endpoint: &Endpoint) -> Result<Channel, AddressError> {
         keep_alive_timeout: PING_EVERY,
         keep_alive_while_idle: false,
         window: Window::Fixed { stream: STREAM_WINDOW_BYTES, connection: STREAM_WINDOW_BYTES },
-        ..ChannelOptions::default()
     })
 }

@@ -184,7 +184,7 @@ impl Fetching {
     }
 
     fn end(&self, status: Status) -> End {
-        let reason = status.message().to_owned();
+        let reason = getup_transport::reason(&status);
         match status.code() {
             // A token that is not known where another was reaches the two of them at different times.
             Code::Unauthenticated if self.admitted => End::Gone(reason),

@@ -83,13 +83,32 @@ async fn a_peer_that_reads_nothing_is_dropped() {
         ..Limits::default()
     };
     let port = Port::limited(&open(), limits).await;
+    flood(&port).await;
+    eventually(async || port.connections() == 0).await;
+}
+
+/// Pings a port and reads nothing, until it is dropped.
+async fn flood(port: &Port) {
     let mut peer = TcpStream::connect(port.address).await.unwrap();
     // The preface and empty settings of HTTP/2, and then pings whose answers stay in the socket.
     peer.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").await.unwrap();
     let pings = b"\0\0\x08\x06\0\0\0\0\0pingpong".repeat(1000);
     let flood = async { while peer.write_all(&pings).await.is_ok() {} };
     tokio::time::timeout(PATIENCE, flood).await.expect("the peer should be dropped");
-    eventually(async || port.connections() == 0).await;
+}
+
+#[tokio::test]
+async fn a_stranger_that_reads_nothing_has_no_longer_than_others() {
+    let folder = Folder::new();
+    let config = folder.token(&generate_token());
+    let limits = Limits {
+        send_timeout: Duration::from_secs(3600),
+        handshake_timeout: Duration::from_millis(500),
+        ..Limits::default()
+    };
+    let port = Port::limited(&config, limits).await;
+    flood(&port).await;
+    eventually(async || port.refused("handshake") == 1 && port.connections() == 0).await;
 }
 
 #[tokio::test]
@@ -119,6 +138,8 @@ async fn what_is_no_address_is_refused_with_the_reason() {
         ("ftp://replay:7400", "neither http nor https"),
         ("https://replay:7400", "security.ca"),
         ("replay:7400/path", "nothing follows the port"),
+        ("replay:7400#part", "nothing else"),
+        ("somebody@replay:7400", "nothing else"),
         ("replay:port", ""),
     ];
     let credentials = Credentials::default();
