@@ -1,11 +1,13 @@
 //! The configuration of a run: one file for all roles, made of one table a room.
 
+mod explained;
 mod layers;
 
 use std::path::Path;
 
 use anyhow::{Context, Result, ensure};
 use clap::Args;
+use documented::DocumentedFieldsOpt;
 use getup_actor::config::ActorConfig;
 use getup_actor::explore::BetaDraw;
 use getup_learner::config::{CurriculumConfig, EvaluationConfig, LearnerConfig, SacConfig};
@@ -16,13 +18,14 @@ use getup_telemetry::TracesConfig;
 use getup_transport::SecurityConfig;
 use serde::{Deserialize, Serialize};
 
+pub(crate) use explained::{Setting, explained};
 pub(crate) use layers::Layers;
 
 /// The format of configuration files that this program writes and reads.
 const FORMAT: u32 = 1;
 
 /// Everything a run depends on.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, DocumentedFieldsOpt)]
 #[serde(default, deny_unknown_fields)]
 pub(crate) struct Config {
     /// The format of this file.
@@ -48,7 +51,7 @@ pub(crate) struct Config {
 }
 
 /// The replay's own settings; when it may be sampled follows from `[sac]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, DocumentedFieldsOpt)]
 #[serde(default, deny_unknown_fields)]
 pub(crate) struct ReplayTable {
     /// Transitions that can be sampled.
@@ -70,7 +73,7 @@ impl Default for ReplayTable {
 }
 
 /// Where the roles listen, and where they find each other.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, DocumentedFieldsOpt)]
 #[serde(default, deny_unknown_fields)]
 pub(crate) struct NetworkConfig {
     /// The replay's gRPC address: it listens there, the others connect there. Of several replays all, separated by
@@ -241,10 +244,16 @@ impl Config {
         Ok(())
     }
 
-    /// The file's text.
+    /// All settings, in the order of the file.
+    pub(crate) fn settings(&self) -> Result<Vec<Setting>> {
+        let text = toml::to_string_pretty(self).context("the configuration is not expressible in TOML")?;
+        Ok(Setting::all(&text))
+    }
+
+    /// The file's text, with what each setting means.
     #[cfg(any(test, feature = "learner"))]
     pub(crate) fn to_toml(&self) -> Result<String> {
-        toml::to_string_pretty(self).context("the configuration is not expressible in TOML")
+        Ok(explained(&self.settings()?))
     }
 
     /// The settings of one of so many replays: they are sampled as often as `[sac]` says, once its uniform steps are
@@ -370,7 +379,7 @@ mod tests {
     #[test]
     fn later_layers_win() {
         let environment =
-            [("GETUP_SAC__BATCH", "64"), ("GETUP_SEED", "7"), ("GETUP_TEST_FULL", "1"), ("HOME", "/")];
+            [("GETUP_SAC__BATCH", "64"), ("GETUP_SEED", "7"), ("GETUP_UPDATE_DOCS", "1"), ("HOME", "/")];
         let config =
             load(&["sac.batch=32", "sac.hidden=[8, 8]", "run=arms", "sac.target_entropy=-4"], &environment);
         let config = config.unwrap();

@@ -24,6 +24,7 @@ mod render;
 mod replay;
 mod role;
 mod rollout;
+mod settings;
 mod status;
 #[cfg(feature = "learner")]
 mod train;
@@ -58,6 +59,7 @@ enum Command {
     Render(render::Args),
     Rollout(rollout::Args),
     Falls(falls::Args),
+    Settings(settings::Args),
     Doctor(doctor::Args),
     Certs(certs::Args),
     Bench(bench::Args),
@@ -82,6 +84,7 @@ fn main() -> ExitCode {
         Command::Render(arguments) => render::run(arguments),
         Command::Rollout(arguments) => rollout::run(arguments),
         Command::Falls(arguments) => falls::run(arguments),
+        Command::Settings(arguments) => settings::run(arguments),
         Command::Doctor(arguments) => doctor::run(arguments),
         Command::Certs(arguments) => certs::run(arguments),
         Command::Bench(arguments) => bench::run(arguments),

@@ -21,6 +21,8 @@ use crate::config::{Config, ConfigArgs};
 
 /// How long the end of a process waits for what does not end by itself.
 const GRACE: Duration = Duration::from_secs(2);
+/// Files that a role may have open beside its gRPC port's connections: its store, its clients, its HTTP port.
+const OTHER_FILES: usize = 1024;
 
 /// What every role's command line shares.
 #[derive(clap::Args, Clone, Debug)]
@@ -59,6 +61,7 @@ impl Role {
         let progress = MultiProgress::new();
         let writer = progress.clone();
         init_logging(log_format, move || LogWriter(writer.clone()))?;
+        raise_open_files(config.network.connections);
         let registry = registry(&config.run);
         build_info(&registry, name);
         let host = host_name();
@@ -157,7 +160,20 @@ pub(crate) async fn bind(address: &str, what: &str) -> Result<TcpListener> {
     })
 }
 
-/// A role that another reaches has to say so to whoever starts it.
+/// Lets the process open as many files as its connections and its store may need: many systems begin with 1,024.
+fn raise_open_files(connections: usize) {
+    let wanted = (connections + OTHER_FILES) as u64;
+    match rlimit::increase_nofile_limit(wanted) {
+        Ok(limit) if limit < wanted => tracing::warn!(
+            "{limit} files and connections may be open here, and network.connections = {connections} may need {wanted}: \
+             raise the limit (ulimit -Hn) or lower the setting"
+        ),
+        Ok(_) => {}
+        Err(error) => tracing::warn!(%error, "cannot raise how many files may be open"),
+    }
+}
+
+/// This machine's name, as logs and traces show it.
 pub(crate) fn host_name() -> String {
     let mut buffer = [0u8; 256];
     // SAFETY: the buffer is valid for its length, of which one byte is kept for the terminator.

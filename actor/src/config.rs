@@ -1,10 +1,11 @@
 //! The settings of an actor: the `[actor]` table of a run's configuration.
 
+use documented::DocumentedFieldsOpt;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 /// How an actor plays and how it sends what it played. The default is the paper's where the paper has a say.
-#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize, DocumentedFieldsOpt)]
 #[serde(deny_unknown_fields, default)]
 pub struct ActorConfig {
     /// Names this actor in logs, metrics and `getup status`; part of what its random draws derive from.

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use getup_sim::Diverged;
+use getup_sim::{Diverged, Divergence};
 
 use crate::identity::Identity;
 
@@ -35,12 +35,17 @@ impl DivergenceLog {
         match write(&path, diverged) {
             Ok(()) => {
                 self.written += 1;
-                let input = path.display();
+                let (input, cause) = (path.display(), &diverged.cause);
+                let how = match cause {
+                    // JSON has no such number to repeat it by.
+                    Divergence::Control => "what came before it can be repeated",
+                    _ => "repeat it",
+                };
                 tracing::warn!(
                     actor = name,
                     lane,
                     episode,
-                    "{diverged}; repeat it with `getup rollout --input {input} --output out.json`"
+                    "{diverged}; {how} with `getup rollout --input {input} --output out.json`"
                 );
             }
             Err(error) => {

@@ -19,7 +19,7 @@ use crate::config::{ConfigError, CurriculumConfig, EvaluationConfig, LearnerConf
 use crate::curriculum::{Curriculum, Outcome};
 use crate::hub::{Hub, Standing};
 use crate::metrics::LearnerMetrics;
-use crate::run_folder::{FolderError, RunFolder};
+use crate::run_folder::{FolderError, RunFolder, write_atomically};
 use crate::sac::{Batch, NonFiniteLoss, Sac, TaskShape};
 
 mod broadcast;
@@ -349,7 +349,7 @@ impl Trainer {
         self.take_reports()?;
         let ending = self.ending.unwrap_or(Ending::Shutdown);
         let last = self.describe(self.sac.evaluated_policy(), self.curriculum.stage_beta());
-        last.save(self.folder.model("last"))?;
+        write_atomically(&self.folder.model("last"), &last.to_bytes())?;
         if ending != Ending::Shutdown {
             self.publish_final()?;
         }

@@ -36,7 +36,7 @@ pub enum ModelError {
     #[error("the model has format version {found}, this program reads up to {VERSION}: update getup")]
     Version {
         /// The file's version.
-        found: u32,
+        found: u64,
     },
     /// A tensor is missing, misshapen or not finite.
     #[error("tensor {name:?} of the model: {problem}")]
@@ -160,7 +160,7 @@ impl Policy {
         }
         match header["version"].as_u64() {
             Some(version) if version <= u64::from(VERSION) => {}
-            Some(version) => return Err(ModelError::Version { found: version as u32 }),
+            Some(version) => return Err(ModelError::Version { found: version }),
             None => return Err(format(&"it names no version")),
         }
         let header: Header = serde_json::from_value(header).map_err(|error| format(&error))?;
@@ -211,15 +211,6 @@ impl Policy {
         let path = path.as_ref();
         let bytes = std::fs::read(path).map_err(|source| ModelError::Io { path: path.to_owned(), source })?;
         Self::from_bytes(&bytes)
-    }
-
-    /// Writes a model file: to a temporary name first, so that a reader never sees half of one.
-    pub fn save(&self, path: impl AsRef<Path>) -> Result<(), ModelError> {
-        let path = path.as_ref();
-        let unfinished = path.with_extension("unfinished");
-        std::fs::write(&unfinished, self.to_bytes())
-            .and_then(|()| std::fs::rename(&unfinished, path))
-            .map_err(|source| ModelError::Io { path: path.to_owned(), source })
     }
 }
 

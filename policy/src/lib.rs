@@ -4,7 +4,7 @@
 //!
 //! - [`PolicyShape`] says what the network looks like and names every tensor of it;
 //! - [`Policy`] is a shape with its weights, observation statistics and metadata; [`Policy::load`] and
-//!   [`Policy::save`] are its file, safetensors that any framework reads;
+//!   [`Policy::to_bytes`] are its file, safetensors that any framework reads;
 //! - [`Forward`] evaluates it on a batch of observations;
 //! - [`squash`] turns a Gaussian sample into an action in `[-β̂, β̂]` (*Learning to Get Up*, App. D);
 //! - [`init`] draws initial weights.

@@ -1,12 +1,16 @@
 //! The settings of the get-up task: the `[task]` table of a run's configuration.
 
+use documented::DocumentedFieldsOpt;
 use serde::{Deserialize, Serialize};
 
 use crate::character::Character;
 use crate::error::ConfigError;
 
+/// More control steps than a phase may have: room for all of them is made at once.
+pub(crate) const MOST_STEPS: usize = 1_000_000;
+
 /// What is simulated and how an episode runs. The default is the paper's (§7) as `evaluation` plays it.
-#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize, DocumentedFieldsOpt)]
 #[serde(deny_unknown_fields, default)]
 pub struct TaskConfig {
     /// The task: `getup`.
@@ -21,7 +25,8 @@ pub struct TaskConfig {
     pub ragdoll_std: f64,
     /// Control steps in the get-up phase; reaching the last is a time limit, not a terminal state.
     pub episode_steps: usize,
-    /// The shape of the reward's `stand` term.
+    /// The shape of the reward's `stand` term in training: `long_tail`, as the paper's results have it and evaluations
+    /// always do, or `gaussian`, as its text has it.
     pub stand: Stand,
     /// Whether falling ends a training episode for good: a head that was over 1.4 m sinks under 1 m. Without, a fall
     /// costs no more than the second that it takes to rise again.
@@ -86,6 +91,11 @@ impl TaskConfig {
         }
         if self.episode_steps == 0 {
             return Err(ConfigError::EpisodeSteps);
+        }
+        for (name, steps) in [("ragdoll_steps", self.ragdoll_steps), ("episode_steps", self.episode_steps)] {
+            if steps > MOST_STEPS {
+                return Err(ConfigError::TooManySteps { name, steps });
+            }
         }
         Ok(())
     }

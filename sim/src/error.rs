@@ -2,6 +2,7 @@
 //! What goes wrong inside one is [`Divergence`](crate::Divergence).
 
 use crate::character::Character;
+use crate::config::MOST_STEPS;
 
 /// Why a world, a task or a lane could not be made or set.
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]
@@ -47,14 +48,6 @@ pub enum SimError {
         /// The number.
         got: f64,
     },
-    /// The saved state belongs to another model.
-    #[error("the saved state has {got} numbers; this world's has {wanted}: it belongs to another character")]
-    SavedState {
-        /// Numbers in the saved state.
-        got: usize,
-        /// Numbers in this world's.
-        wanted: usize,
-    },
 }
 
 /// A setting of the task that is out of range.
@@ -80,6 +73,14 @@ pub enum ConfigError {
     /// Episodes without a step.
     #[error("task.episode_steps is 0; it must be at least 1 (the paper's is 250)")]
     EpisodeSteps,
+    /// Phases for which no memory is.
+    #[error("task.{name} is {steps}; it must be at most {MOST_STEPS}")]
+    TooManySteps {
+        /// Which.
+        name: &'static str,
+        /// How many.
+        steps: usize,
+    },
     /// Weights of reset sources that no draw can follow.
     #[error("the resets' weights are {0:?}; they must be finite and at least 0, and one must be above 0")]
     Resets(Vec<f64>),

@@ -141,7 +141,9 @@ fn play_all(task: &Arc<dyn Task>, seeds: &[u64]) -> Result<Vec<Landed>, FallsErr
         loop {
             let index = next.fetch_add(1, Ordering::Relaxed);
             let Some(&seed) = seeds.get(index) else { return Ok(done) };
-            done.push((index, play(&mut lane, seed)?));
+            // After a fall that failed nobody begins another.
+            let landed = play(&mut lane, seed).inspect_err(|_| next.store(seeds.len(), Ordering::Relaxed))?;
+            done.push((index, landed));
         }
     };
     let threads = thread::available_parallelism().map_or(1, NonZero::get).min(seeds.len().max(1));

@@ -48,7 +48,8 @@ pub struct Diverged {
     pub phase: Phase,
     /// In which of the phase's steps, from 0.
     pub step: usize,
-    /// The phase's first state and all its actions, the fatal one last: `getup rollout` repeats the failure from it.
+    /// The phase's first state and all its actions, the fatal one last: `getup rollout` repeats the failure from it. One
+    /// that is no number is left out, as JSON has none.
     pub recording: Box<RolloutFile>,
 }
 
@@ -84,7 +85,7 @@ impl Lane {
     /// A lane at the default pose with β̂ = 1, waiting for its first [`begin`](Lane::begin).
     pub fn new(task: Arc<dyn Task>) -> Lane {
         let world = task.world();
-        let longest = task.episode_steps().max(task.resets().longest());
+        let longest = task.episode_steps().max(task.resets().longest()).max(task.standing().limp_steps);
         let mut lane = Lane {
             rng: ChaCha8Rng::seed_from_u64(0),
             fall: None,
@@ -237,7 +238,11 @@ impl Lane {
             beta: self.beta,
             qpos0: qpos0.clone(),
             qvel0: qvel0.clone(),
-            actions: actions.chunks(self.task.action_width()).map(<[f64]>::to_vec).collect(),
+            actions: actions
+                .chunks(self.task.action_width())
+                .filter(|action| action.iter().all(|control| control.is_finite()))
+                .map(<[f64]>::to_vec)
+                .collect(),
             ..Rollout::default()
         };
         let recording = Box::new(RolloutFile {

@@ -50,7 +50,7 @@ pub use lane::{Diverged, Lane, Phase, Step};
 pub use reset::{Fall, Resets, Source, Standing};
 pub use task::Task;
 pub use tolerance::{Sigmoid, tolerance};
-pub use world::{Body, Divergence, SavedState, World};
+pub use world::{Body, Divergence, World};
 
 /// The version of the MuJoCo library that is loaded, such as `3.17.0`.
 pub fn mujoco_version() -> &'static str {

@@ -12,9 +12,6 @@ use mujoco_rs::prelude::*;
 use crate::character::Character;
 use crate::error::{ConfigError, SimError};
 
-/// Every number of the physics state: time, positions, velocities, warm start, applied forces.
-const WHOLE_STATE: u32 = MjtState::mjSTATE_INTEGRATION as u32;
-
 /// The largest magnitude MuJoCo takes for a sane position or velocity.
 const SANE: f64 = 1e10;
 
@@ -31,10 +28,6 @@ pub struct World {
 /// A body of a [`World`]'s model: an index that holds for every world of the same character.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Body(usize);
-
-/// A world's whole physics state, as [`World::save`] takes it.
-#[derive(Clone, PartialEq, Debug)]
-pub struct SavedState(Box<[f64]>);
 
 /// How a simulation failed: the first of MuJoCo's warnings that the step raised.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
@@ -271,36 +264,6 @@ impl World {
     /// The velocity of that centre of mass, in metres a second.
     pub fn centre_of_mass_velocity(&self, body: Body) -> [f64; 3] {
         self.data.subtree_linvel()[body.0]
-    }
-
-    /// A state of this world's size, for [`save`](World::save) to fill.
-    pub fn saved_state(&self) -> SavedState {
-        SavedState(self.data.state(WHOLE_STATE))
-    }
-
-    /// Copies the whole physics state out. Allocates nothing.
-    ///
-    /// # Panics
-    /// If `state` was made by a world of another character.
-    pub fn save(&self, state: &mut SavedState) {
-        self.data.read_state_into(WHOLE_STATE, &mut state.0);
-    }
-
-    /// Goes back to a saved state: what follows is bit for bit what followed it.
-    ///
-    /// # Errors
-    /// [`SimError::SavedState`] if it was saved by a world of another character.
-    pub fn restore(&mut self, state: &SavedState) -> Result<(), SimError> {
-        let wanted = self.data.model().state_size(WHOLE_STATE);
-        if state.0.len() != wanted {
-            return Err(SimError::SavedState { got: state.0.len(), wanted });
-        }
-        self.data.reset();
-        self.data.set_state(&state.0, WHOLE_STATE).expect("the length was checked above");
-        // Not mj_forward, which would replace the saved warm start: the next step begins with mj_step2.
-        self.data.step1();
-        self.data.subtree_vel();
-        Ok(())
     }
 }
 

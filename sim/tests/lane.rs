@@ -201,6 +201,8 @@ fn a_bad_setting_is_named_with_its_value() {
     assert_eq!(refuse(TaskConfig { crouch_cost: 1.5, ..default() }), ConfigError::CrouchCost(1.5));
     assert_eq!(refuse(TaskConfig { crouch_height: 0.0, ..default() }), ConfigError::CrouchHeight(0.0));
     assert_eq!(refuse(TaskConfig { episode_steps: 0, ..default() }), ConfigError::EpisodeSteps);
+    let long = refuse(TaskConfig { ragdoll_steps: 1_000_000_000_000, ..default() }).to_string();
+    assert_eq!(long, "task.ragdoll_steps is 1000000000000; it must be at most 1000000");
     let error = refuse(TaskConfig { name: "walk".to_owned(), ..default() });
     assert_eq!(error.to_string(), "task.name is \"walk\"; the only task is \"getup\"");
 }

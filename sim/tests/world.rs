@@ -64,28 +64,6 @@ fn what_is_read_after_a_step_belongs_to_the_new_state() {
 }
 
 #[test]
-fn a_restored_world_goes_on_bit_for_bit() {
-    let mut world = busy_world();
-    let mut saved = world.saved_state();
-    let mut futures = Vec::new();
-    for _ in 0..2 {
-        world.save(&mut saved);
-        for _ in 0..20 {
-            world.step(&[0.3; 21], 5).unwrap();
-        }
-        futures.push((
-            world.qpos().to_vec(),
-            world.qvel().to_vec(),
-            world.centre_of_mass_velocity(world.body("torso").unwrap()),
-        ));
-        world.restore(&saved).unwrap();
-    }
-    assert_eq!(futures[0], futures[1]);
-    let error = getup_sim::World::new(Character::Cast, 200, 1.0).unwrap().restore(&saved).unwrap_err();
-    assert!(matches!(error, SimError::SavedState { .. }), "{error}");
-}
-
-#[test]
 fn the_control_limit_is_the_motors_clamp() {
     let after = |limit: f64, control: f64| {
         let mut world = World::new(Character::Standard, 200, limit).unwrap();

@@ -34,7 +34,15 @@ const NOT_SETTINGS: [&str; 12] = [
     "GETUP_ACTOR_MEMORY",
 ];
 /// How names of others begin: of the tests and benchmarks.
-const OTHER_PREFIXES: [&str; 2] = ["GETUP_TEST_", "GETUP_PEERS_"];
+const OTHER_PREFIXES: [&str; 7] = [
+    "GETUP_TEST_",
+    "GETUP_UPDATE_",
+    "GETUP_SIMULATION_",
+    "GETUP_SOAK_",
+    "GETUP_FLEET_",
+    "GETUP_PEERS_",
+    "GETUP_REVERB_",
+];
 /// Chooses the preset where the command line does not.
 pub(super) const PRESET_VARIABLE: &str = "GETUP_PRESET";
 

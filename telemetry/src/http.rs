@@ -1,8 +1,11 @@
 //! A role's HTTP port: `GET /metrics` for Prometheus, `/healthz` for whoever starts and stops containers.
 
 use std::io;
+use std::net::SocketAddr;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::Router;
@@ -10,13 +13,22 @@ use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+use axum::serve::Listener;
 use prometheus::{Registry, TEXT_FORMAT, TextEncoder};
-use tokio::net::TcpListener;
+use socket2::{SockRef, TcpKeepalive};
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::Shutdown;
 
 /// How long a request that is under way at shutdown may take to end.
 const GRACE: Duration = Duration::from_secs(1);
+
+/// Connections at once; further ones wait. Prometheus keeps one, a health check needs one for a moment.
+const MOST_CONNECTIONS: usize = 64;
+/// A peer that is silent for this long is probed, and gone after some probes without an answer.
+const SILENCE: Duration = Duration::from_secs(30);
 
 /// Whether a role does its work: it does not while it reads back its store. Clones share it.
 #[derive(Clone, Debug, Default)]
@@ -55,11 +67,79 @@ pub async fn serve_http(listener: TcpListener, shown: Shown, shutdown: Shutdown)
         .route("/healthz", get(health))
         .route("/livez", get(|| async { "ok\n" }))
         .with_state((shown, shutdown.clone()));
-    let server = axum::serve(listener, router).with_graceful_shutdown(async move { ended.wait().await });
+    let server =
+        axum::serve(Port::new(listener), router).with_graceful_shutdown(async move { ended.wait().await });
     tokio::select! {
         result = server => result,
         // A client that never finishes its request must not hold up the end.
         () = async { shutdown.wait().await; tokio::time::sleep(GRACE).await } => Ok(()),
+    }
+}
+
+/// The listener, with so many places for connections: whoever fills them must not take the files that a role needs. A
+/// peer that vanished without a word gives its place back.
+struct Port {
+    listener: TcpListener,
+    places: Arc<Semaphore>,
+}
+
+/// A connection in its place.
+struct Placed {
+    stream: TcpStream,
+    _place: OwnedSemaphorePermit,
+}
+
+impl Port {
+    fn new(listener: TcpListener) -> Self {
+        Self { listener, places: Arc::new(Semaphore::new(MOST_CONNECTIONS)) }
+    }
+}
+
+impl Listener for Port {
+    type Io = Placed;
+    type Addr = SocketAddr;
+
+    async fn accept(&mut self) -> (Placed, SocketAddr) {
+        let place = self.places.clone().acquire_owned().await.expect("the places are never closed");
+        // Waits and tries again where the system gives no connection.
+        let (stream, peer) = Listener::accept(&mut self.listener).await;
+        let keep_alive = TcpKeepalive::new().with_time(SILENCE).with_interval(SILENCE);
+        if let Err(error) = SockRef::from(&stream).set_tcp_keepalive(&keep_alive) {
+            tracing::debug!(%peer, %error, "a connection that will not be missed if it vanishes");
+        }
+        (Placed { stream, _place: place }, peer)
+    }
+
+    fn local_addr(&self) -> io::Result<SocketAddr> {
+        self.listener.local_addr()
+    }
+}
+
+impl AsyncRead for Placed {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_read(context, buffer)
+    }
+}
+
+impl AsyncWrite for Placed {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write(context, bytes)
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
     }
 }
 

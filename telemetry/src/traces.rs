@@ -7,15 +7,16 @@
 //! not taken after its retries, is lost and counted.
 
 use std::fmt;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
+use documented::DocumentedFieldsOpt;
 use getup_proto::{SegmentTrace, TraceContext, mix};
 use opentelemetry::InstrumentationScope;
 use opentelemetry::trace::{SpanContext, SpanId, Status, TraceFlags, TraceId, TraceState};
 pub use opentelemetry::{KeyValue, trace::SpanKind};
-use opentelemetry_otlp::{SpanExporter as OtlpExporter, WithExportConfig};
+use opentelemetry_otlp::{SpanExporter as OtlpExporter, WithExportConfig, WithTonicConfig};
 use opentelemetry_sdk::Resource;
 use opentelemetry_sdk::error::OTelSdkResult;
 use opentelemetry_sdk::trace::{
@@ -25,6 +26,7 @@ use prometheus::{IntCounter, IntCounterVec, Opts, Registry};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 use tokio::runtime::Runtime;
+use tonic::transport::Endpoint;
 
 /// Spans that may wait to be exported, those on their way included; beyond, they are lost.
 pub const QUEUE_SPANS: usize = 2048;
@@ -40,7 +42,7 @@ const LAST_EXPORT: Duration = Duration::from_secs(1);
 const WARN_EVERY: Duration = Duration::from_secs(60);
 
 /// `[traces]`: which segments are followed, and who is told.
-#[derive(Clone, PartialEq, Debug, Serialize, Deserialize)]
+#[derive(Clone, PartialEq, Debug, Serialize, Deserialize, DocumentedFieldsOpt)]
 #[serde(default, deny_unknown_fields)]
 pub struct TracesConfig {
     /// The collector that takes OTLP over gRPC, such as `http://collector:4317`; empty turns traces off.
@@ -138,6 +140,8 @@ struct Exporting {
 struct Toll {
     /// That wait, or are on their way.
     queued: AtomicUsize,
+    /// Nothing is exported any more.
+    closed: AtomicBool,
     exported: IntCounter,
     lost: IntCounter,
     warned: Mutex<Option<Instant>>,
@@ -166,7 +170,11 @@ impl Traces {
             .map_err(|error| refused(error.to_string()))?;
         let exporter = {
             let _entered = runtime.enter();
-            let builder = OtlpExporter::builder().with_tonic().with_endpoint(&config.endpoint);
+            let endpoint = Endpoint::from_shared(config.endpoint.clone());
+            let endpoint = endpoint.map_err(|error| refused(error.to_string()))?;
+            // A collector whose packets are lost is given up as soon as one that does not answer.
+            let channel = endpoint.connect_timeout(EXPORT_PATIENCE).timeout(EXPORT_PATIENCE).connect_lazy();
+            let builder = OtlpExporter::builder().with_tonic().with_channel(channel);
             builder.with_timeout(EXPORT_PATIENCE).build().map_err(|error| refused(error.to_string()))?
         };
         let batches = BatchConfigBuilder::default()
@@ -262,9 +270,9 @@ impl Traces {
 
     /// Exports what waits, for a second at most; spans that come later are lost.
     pub fn shutdown(&self) {
-        if let Some(Exporting { processor, toll, .. }) = self.0.as_deref()
-            && processor.shutdown_with_timeout(LAST_EXPORT).is_err()
-        {
+        let Some(Exporting { processor, toll, .. }) = self.0.as_deref() else { return };
+        toll.closed.store(true, Ordering::Relaxed);
+        if processor.shutdown_with_timeout(LAST_EXPORT).is_err() {
             let left = toll.queued.load(Ordering::Relaxed);
             tracing::warn!(
                 "{left} spans of traces are lost: the collector did not take them within {LAST_EXPORT:?}"
@@ -297,11 +305,21 @@ impl Toll {
         let spans = IntCounterVec::new(options, &["result"]).expect("the name and labels are well-formed");
         registry.register(Box::new(spans.clone())).expect("a process counts its traces once");
         let [exported, lost] = ["exported", "lost"].map(|result| spans.with_label_values(&[result]));
-        Self { queued: AtomicUsize::new(0), exported, lost, warned: Mutex::default() }
+        Self {
+            queued: AtomicUsize::new(0),
+            closed: AtomicBool::new(false),
+            exported,
+            lost,
+            warned: Mutex::default(),
+        }
     }
 
     /// Makes room for a span in the queue; false where there is none.
     fn admit(&self) -> bool {
+        if self.closed.load(Ordering::Relaxed) {
+            self.lose(1, "the process ends");
+            return false;
+        }
         let room = |queued: usize| (queued < QUEUE_SPANS).then_some(queued + 1);
         let admitted = self.queued.fetch_update(Ordering::Relaxed, Ordering::Relaxed, room).is_ok();
         if !admitted {

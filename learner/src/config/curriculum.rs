@@ -1,11 +1,12 @@
 //! What is asked of a policy, and when: the `[curriculum]` and `[evaluation]` tables.
 
+use documented::DocumentedFieldsOpt;
 use serde::{Deserialize, Serialize};
 
 use super::{ConfigError, check};
 
 /// The strong-to-weak torque curriculum (§5, Algorithm 1).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, DocumentedFieldsOpt)]
 #[serde(default, deny_unknown_fields)]
 pub struct CurriculumConfig {
     /// β of stage 0; where above 1, also the upper clip of β̂ and the actuators' clamp, which else are 1.
@@ -86,7 +87,7 @@ impl CurriculumConfig {
 }
 
 /// When and how policies are evaluated.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, DocumentedFieldsOpt)]
 #[serde(default, deny_unknown_fields)]
 pub struct EvaluationConfig {
     /// Env steps from one evaluation to the next.

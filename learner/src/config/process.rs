@@ -1,11 +1,12 @@
 //! The learner as a process: the `[learner]` table.
 
+use documented::DocumentedFieldsOpt;
 use serde::{Deserialize, Serialize};
 
 use super::{ConfigError, check};
 
 /// The learner as a process.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, DocumentedFieldsOpt)]
 #[serde(default, deny_unknown_fields)]
 pub struct LearnerConfig {
     /// `cpu`, or `cuda` for the first NVIDIA device.

@@ -1,15 +1,17 @@
 //! How soft actor-critic learns: the `[sac]` table.
 
+use documented::DocumentedFieldsOpt;
 use getup_policy::{Body, PolicyShape};
+use getup_proto::MAX_MESSAGE_BYTES;
 use serde::{Deserialize, Serialize};
 
 use super::{ConfigError, check};
 
 /// Soft actor-critic (App. D, Table 1).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, DocumentedFieldsOpt)]
 #[serde(default, deny_unknown_fields)]
 pub struct SacConfig {
-    /// What the networks are made of.
+    /// What the networks are made of: `mlp`, or `simba`, residual blocks behind layer norms.
     pub network: NetworkKind,
     /// `mlp`: widths of the hidden layers of the actor and of every critic.
     pub hidden: Vec<usize>,
@@ -67,7 +69,8 @@ pub struct SacConfig {
     /// evaluated and kept as a model, while the actor itself goes on exploring: one that sways from update to update is
     /// better on average than at any one.
     pub actor_average: f64,
-    /// Precision of the hidden layers' matrix products; weights, heads and losses are always float32.
+    /// Precision of the hidden layers' matrix products: `fp32`, `bf16`, or `auto`, whichever this processor multiplies
+    /// faster. Weights, heads and losses are always float32.
     pub precision: Precision,
     /// Whether observations are normalised by running statistics.
     pub normalize_observations: bool,
@@ -180,6 +183,9 @@ impl Default for SacConfig {
     }
 }
 
+/// No task has longer observations or actions.
+const WIDEST: (usize, usize) = (256, 64);
+
 impl SacConfig {
     /// Refuses settings that cannot train.
     pub fn validate(&self) -> Result<(), ConfigError> {
@@ -193,6 +199,7 @@ impl SacConfig {
         {
             check(blocks <= 64, key, &blocks, "from 0 to 64")?;
         }
+        self.check_policy()?;
         check((1..=16).contains(&self.critics), "sac.critics", &self.critics, "from 1 to 16")?;
         check((1..=65_536).contains(&self.batch), "sac.batch", &self.batch, "from 1 to 65536")?;
         check((0.0..1.0).contains(&self.gamma), "sac.gamma", &self.gamma, "at least 0 and under 1")?;
@@ -224,6 +231,23 @@ impl SacConfig {
         check((0.0..=1.0).contains(&exponent), "sac.importance_exponent", &exponent, "from 0 to 1")?;
         let rate = self.updates_per_step;
         check(rate > 0.0 && rate <= 100.0, "sac.updates_per_step", &rate, "over 0, at most 100")
+    }
+
+    /// Refuses a policy that no actor would take: more layers than a model has, or more bytes than a message.
+    fn check_policy(&self) -> Result<(), ConfigError> {
+        let key = match self.network {
+            NetworkKind::Mlp => "sac.hidden",
+            NetworkKind::Simba => "sac.actor_width",
+        };
+        let shape = self.policy_shape(WIDEST.0, WIDEST.1);
+        if let Some(fault) = shape.fault() {
+            return check(false, key, &fault, "a policy that its file can hold");
+        }
+        let numbers: usize = shape.tensors().iter().map(|(_, sizes)| sizes.iter().product::<usize>()).sum();
+        // What else an update says takes less than the last megabyte.
+        let bytes = numbers * size_of::<f32>() + (1 << 20);
+        let value = format!("a policy of {} MB", bytes >> 20);
+        check(bytes <= MAX_MESSAGE_BYTES, key, &value, "one that a message to the actors holds, under 64 MB")
     }
 
     /// Refuses settings under which nothing is learned by networks that begin untrained: minibatches, of which statistics
@@ -277,6 +301,18 @@ mod tests {
         assert!(config(5_001).validate_untrained().is_ok());
         let error = config(5_000).validate_untrained().unwrap_err().to_string();
         assert!(error.contains("sac.normalize_until = 5000: over sac.uniform_steps"), "{error}");
+    }
+
+    #[test]
+    fn a_policy_that_actors_cannot_be_sent_is_refused_by_the_setting_that_makes_it() {
+        let error = |hidden| SacConfig { hidden, ..SacConfig::default() }.validate().unwrap_err().to_string();
+        let large = error(vec![4096, 4096]);
+        assert!(large.contains("sac.hidden = a policy of 71 MB"), "{large}");
+        let deep = error(vec![8; 65]);
+        assert!(deep.contains("65 layers or blocks, more than 64"), "{deep}");
+        let network = NetworkKind::Simba;
+        let wide = SacConfig { network, actor_width: 2048, ..SacConfig::default() }.validate().unwrap_err();
+        assert!(wide.to_string().contains("sac.actor_width"), "{wide}");
     }
 
     #[test]
