@@ -9,8 +9,8 @@
 //! | load | each actor's two connections: segments of 64 steps appended, policies heard and parsed, a heartbeat a second | no physics: segments come at a fixed pace |
 //!
 //! An actor makes [`ENV_STEPS`] env steps a second, a sixth of what a core with physics makes, so that 256 of them fit on
-//! two cores beside the services. The learner samples as preset `laptop` does, 0.4 minibatches of 128 an env step, but no
-//! more than [`MOST_MINIBATCHES`] a second, which is what two cores train on. The replay's limiter is off.
+//! two cores beside the services. The learner samples 0.4 minibatches of 128 an env step, but no
+//! more than [`MOST_MINIBATCHES`] a second, which two cores can train on. The replay's limiter is off.
 //!
 //! | row | |
 //! | --- | --- |
