@@ -220,9 +220,10 @@ impl Connector {
 /// What a call's status says. Where the connection broke, tonic says so and keeps the reason to itself: this says the
 /// reason, such as a certificate that the peer refused.
 pub fn reason(status: &Status) -> String {
-    match status.source() {
-        Some(cause) => format!("{}: {}", status.message(), root_cause(cause)),
-        None => status.message().to_owned(),
+    let said = status.message();
+    match status.source().map(root_cause) {
+        Some(cause) if !said.contains(&cause) => format!("{said}: {cause}"),
+        _ => said.to_owned(),
     }
 }
 

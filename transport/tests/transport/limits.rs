@@ -124,9 +124,10 @@ async fn a_call_to_nobody_names_the_address_and_what_is_wrong() {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap().to_string();
     drop(listener);
-    let (code, message) = refusal(&channel(&address, &open())).await;
-    assert_eq!(code, Code::Unavailable);
-    assert!(message.contains(&address) && message.contains("refused"), "{message}");
+    let status = call(&channel(&address, &open())).await.unwrap_err();
+    assert_eq!(status.code(), Code::Unavailable);
+    let reason = getup_transport::reason(&status);
+    assert!(reason.contains(&address) && reason.matches("refused").count() == 1, "{reason}");
 }
 
 #[tokio::test]
