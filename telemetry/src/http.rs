@@ -15,10 +15,10 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::serve::Listener;
 use prometheus::{Registry, TEXT_FORMAT, TextEncoder};
-use socket2::{SockRef, TcpKeepalive};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::{Instant, Sleep};
 
 use crate::Shutdown;
 
@@ -26,9 +26,9 @@ use crate::Shutdown;
 const GRACE: Duration = Duration::from_secs(1);
 
 /// Connections at once; further ones wait. Prometheus keeps one, a health check needs one for a moment.
-const MOST_CONNECTIONS: usize = 64;
-/// A peer that is silent for this long is probed, and gone after some probes without an answer.
-const SILENCE: Duration = Duration::from_secs(30);
+const MOST_CONNECTIONS: usize = 256;
+/// A connection on which nothing comes or goes for this long is closed.
+const SILENCE: Duration = Duration::from_secs(75);
 
 /// Whether a role does its work: it does not while it reads back its store. Clones share it.
 #[derive(Clone, Debug, Default)]
@@ -76,8 +76,8 @@ pub async fn serve_http(listener: TcpListener, shown: Shown, shutdown: Shutdown)
     }
 }
 
-/// The listener, with so many places for connections: whoever fills them must not take the files that a role needs. A
-/// peer that vanished without a word gives its place back.
+/// The listener, with so many places for connections: whoever fills them must not take the files that a role needs. One
+/// that is silent, or vanished without a word, gives its place back.
 struct Port {
     listener: TcpListener,
     places: Arc<Semaphore>,
@@ -86,6 +86,8 @@ struct Port {
 /// A connection in its place.
 struct Placed {
     stream: TcpStream,
+    /// When it has been silent for too long.
+    end: Pin<Box<Sleep>>,
     _place: OwnedSemaphorePermit,
 }
 
@@ -103,15 +105,22 @@ impl Listener for Port {
         let place = self.places.clone().acquire_owned().await.expect("the places are never closed");
         // Waits and tries again where the system gives no connection.
         let (stream, peer) = Listener::accept(&mut self.listener).await;
-        let keep_alive = TcpKeepalive::new().with_time(SILENCE).with_interval(SILENCE);
-        if let Err(error) = SockRef::from(&stream).set_tcp_keepalive(&keep_alive) {
-            tracing::debug!(%peer, %error, "a connection that will not be missed if it vanishes");
-        }
-        (Placed { stream, _place: place }, peer)
+        (Placed { stream, end: Box::pin(tokio::time::sleep(SILENCE)), _place: place }, peer)
     }
 
     fn local_addr(&self) -> io::Result<SocketAddr> {
         self.listener.local_addr()
+    }
+}
+
+impl Placed {
+    /// What a read or write has come to, or that it has been waited for too long.
+    fn watched<T>(&mut self, done: Poll<io::Result<T>>, context: &mut Context<'_>) -> Poll<io::Result<T>> {
+        if done.is_ready() {
+            self.end.as_mut().reset(Instant::now() + SILENCE);
+            return done;
+        }
+        self.end.as_mut().poll(context).map(|()| Err(io::ErrorKind::TimedOut.into()))
     }
 }
 
@@ -121,7 +130,8 @@ impl AsyncRead for Placed {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_read(context, buffer)
+        let read = Pin::new(&mut self.stream).poll_read(context, buffer);
+        self.watched(read, context)
     }
 }
 
@@ -131,7 +141,8 @@ impl AsyncWrite for Placed {
         context: &mut Context<'_>,
         bytes: &[u8],
     ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write(context, bytes)
+        let written = Pin::new(&mut self.stream).poll_write(context, bytes);
+        self.watched(written, context)
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
