@@ -83,15 +83,15 @@ pub(crate) struct NetworkConfig {
     pub(crate) learner: String,
     /// Where an actor serves gRPC health; port 0 takes any.
     pub(crate) actor: String,
-    /// Where each role serves `/metrics`; port 0 takes any.
+    /// Where a replay serves `/metrics`; port 0 takes any.
     pub(crate) replay_metrics: String,
-    /// See `replay_metrics`.
+    /// Where the learner does, and `getup train`.
     pub(crate) learner_metrics: String,
-    /// See `replay_metrics`.
+    /// Where an actor does.
     pub(crate) actor_metrics: String,
-    /// Connections that a role's gRPC port takes, and from one address: actors behind one address share it.
+    /// Connections that a role's gRPC port takes.
     pub(crate) connections: usize,
-    /// See `connections`.
+    /// Those that it takes from one address: actors behind one address share it.
     pub(crate) connections_per_address: usize,
 }
 
@@ -246,8 +246,10 @@ impl Config {
 
     /// All settings, in the order of the file.
     pub(crate) fn settings(&self) -> Result<Vec<Setting>> {
-        let text = toml::to_string_pretty(self).context("the configuration is not expressible in TOML")?;
-        Ok(Setting::all(&text))
+        let table = toml::Table::try_from(self);
+        table
+            .and_then(|table| Setting::all("", table))
+            .context("the configuration is not expressible in TOML")
     }
 
     /// The file's text, with what each setting means.

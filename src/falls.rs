@@ -17,6 +17,8 @@ pub(crate) struct Args {
     #[arg(long, default_value_t = 100)]
     count: usize,
     /// Seed of all draws.
+    ///
+    /// The first falls are those that a run of this seed is evaluated on.
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// The file to write.

@@ -20,7 +20,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let settings = arguments.config.load()?.settings()?;
     let asked = |setting: &&Setting| {
         let name = format!("{}.{}", setting.table, setting.key);
-        arguments.words.is_empty() || arguments.words.iter().any(|word| name.contains(word.as_str()))
+        arguments.words.is_empty() || arguments.words.iter().any(|word| name.contains(&word.to_lowercase()))
     };
     let shown: Vec<&Setting> = settings.iter().filter(asked).collect();
     ensure!(

@@ -16,26 +16,24 @@ pub(crate) struct Setting {
     /// Its name in it.
     pub(crate) key: String,
     /// `key = value`, over one line or several.
-    pub(crate) text: String,
+    text: String,
 }
 
 impl Setting {
-    /// The settings of a file that [`Config::to_toml`] has written without words.
-    pub(crate) fn all(toml: &str) -> Vec<Self> {
-        let mut settings: Vec<Self> = Vec::new();
-        let mut table = String::new();
-        for line in toml.lines().filter(|line| !line.is_empty()) {
-            let name = line.split_once(" = ").map(|(name, _)| name).filter(|name| !name.starts_with(' '));
-            if let Some(header) = line.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')) {
-                table = header.to_owned();
-            } else if let Some(name) = name {
-                let (table, key) = (table.clone(), name.to_owned());
-                settings.push(Self { table, key, text: line.to_owned() });
-            } else if let Some(last) = settings.last_mut() {
-                last.text += &format!("\n{line}");
+    /// The settings of a table and of those in it, in the order of the file: a table's own come first.
+    pub(crate) fn all(name: &str, table: toml::Table) -> Result<Vec<Self>, toml::ser::Error> {
+        let (mut own, mut others) = (Vec::new(), Vec::new());
+        for (key, value) in table {
+            if let toml::Value::Table(inner) = value {
+                let inner_name = if name.is_empty() { key } else { format!("{name}.{key}") };
+                others.extend(Self::all(&inner_name, inner)?);
+            } else {
+                let text = toml::to_string_pretty(&toml::Table::from_iter([(key.clone(), value)]))?;
+                own.push(Self { table: name.to_owned(), key, text });
             }
         }
-        settings
+        own.append(&mut others);
+        Ok(own)
     }
 
     /// What it means.
@@ -75,7 +73,6 @@ pub(crate) fn explained<'a>(settings: impl IntoIterator<Item = &'a Setting>) -> 
             text += &format!("# {}\n", line.trim());
         }
         text += &setting.text;
-        text += "\n";
     }
     text
 }
@@ -88,14 +85,16 @@ mod tests {
     fn every_setting_is_explained_and_the_file_is_the_same_configuration() {
         let remover = getup_replay::Remover::LowestPriority { window: 3 };
         let replay = ReplayTable { remover, priority_exponent: 0.5, ..ReplayTable::default() };
-        let config = Config { replay, ..Config::default() };
-        let text = toml::to_string_pretty(&config).unwrap();
-        let settings = Setting::all(&text);
+        // No name that anybody would choose.
+        let run = "a = \"b\"\n\n[x]\nseed = 3".to_owned();
+        let config = Config { replay, run, ..Config::default() };
+        let settings = config.settings().unwrap();
         assert!(settings.len() > 80);
         for setting in &settings {
             let meaning = setting.meaning().unwrap_or_default();
             assert!(!meaning.is_empty(), "{}.{} is not explained", setting.table, setting.key);
-            assert!(!meaning.contains("[`"), "{}.{}: {meaning}", setting.table, setting.key);
+            let elsewhere = meaning.contains("[`") || meaning.starts_with("See ");
+            assert!(!elsewhere, "{}.{}: {meaning}", setting.table, setting.key);
         }
         assert_eq!(toml::from_str::<Config>(&explained(&settings)).unwrap(), config);
     }

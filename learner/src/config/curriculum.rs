@@ -13,7 +13,7 @@ pub struct CurriculumConfig {
     pub beta_start: f64,
     /// β never goes under it.
     pub beta_floor: f64,
-    /// β stays at `beta_start`: no evaluation promotes, and `best` is the one with the most falls that end standing.
+    /// β stays at `beta_start` (in a run that is resumed, at what it has come to): no evaluation promotes, and `best` is the one with the most falls that end standing.
     pub fixed: bool,
     /// Env steps without a better evaluation that end the training of a fixed β; 0 for no end.
     pub patience: u64,
@@ -32,9 +32,9 @@ pub struct CurriculumConfig {
     pub high_starts: f64,
     /// By how much every such promotion lowers that share.
     pub high_starts_fade: f64,
-    /// Bounds of the env steps that a stage after the discovery may last.
+    /// Env steps that a stage after the discovery may last at least: N_min. The limit is 1.5 × what the one before took.
     pub n_min: u64,
-    /// See `n_min`.
+    /// The most that it may last: N_max.
     pub n_max: u64,
 }
 

@@ -72,7 +72,8 @@ pub struct SacConfig {
     /// Precision of the hidden layers' matrix products: `fp32`, `bf16`, or `auto`, whichever this processor multiplies
     /// faster. Weights, heads and losses are always float32.
     pub precision: Precision,
-    /// Whether observations are normalised by running statistics.
+    /// Whether observations are normalised by running statistics: those of the minibatches, in which early env steps count
+    /// more than late ones.
     pub normalize_observations: bool,
     /// Env steps after which those statistics no longer change.
     pub normalize_until: u64,
