@@ -92,6 +92,10 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     }
     if let Some(path) = &arguments.record {
         eprintln!("Episodes written to {}", path.display());
+        let failed = episodes.iter().filter(|episode| episode.head_heights.is_empty()).count();
+        if failed > 0 {
+            eprintln!("{failed} falls failed, and are not in it");
+        }
     }
     Ok(())
 }

@@ -32,7 +32,7 @@ pub struct EvaluatedEpisode {
 }
 
 impl EvaluatedEpisode {
-    /// Whose simulation failed.
+    /// An episode whose simulation failed.
     fn failed(seed: u64, cause: String) -> Self {
         Self { seed, episode_return: 0.0, head_heights: Vec::new(), diverged: Some(cause) }
     }
@@ -243,7 +243,7 @@ impl Evaluator {
         Ok(())
     }
 
-    /// Gives every free lane the next seed, and returns the episodes that end before they begin: their falls failed.
+    /// Gives every free lane one more seed, and returns the episodes that end before they begin: their falls failed.
     fn seat(
         &mut self,
         waiting: &mut impl Iterator<Item = (usize, u64)>,
@@ -252,15 +252,10 @@ impl Evaluator {
     ) -> Vec<(usize, EvaluatedEpisode)> {
         let mut failed = Vec::new();
         for player in self.players.iter_mut().filter(|player| player.playing.is_none()) {
-            for (index, seed) in waiting.by_ref() {
-                let fall = self.landed.entry(seed).or_insert_with(|| player.fall(seed));
-                match fall {
-                    Ok(landed) => {
-                        player.begin(index, seed, landed, beta, record);
-                        break;
-                    }
-                    Err(cause) => failed.push((index, EvaluatedEpisode::failed(seed, cause.clone()))),
-                }
+            let Some((index, seed)) = waiting.next() else { break };
+            match self.landed.entry(seed).or_insert_with(|| player.fall(seed)) {
+                Ok(landed) => player.begin(index, seed, landed, beta, record),
+                Err(cause) => failed.push((index, EvaluatedEpisode::failed(seed, cause.clone()))),
             }
         }
         failed

@@ -7,7 +7,7 @@ use crate::character::Character;
 use crate::error::ConfigError;
 
 /// More control steps than a phase may have: room for all of them is made at once.
-pub(crate) const MOST_STEPS: usize = 1_000_000;
+const MOST_STEPS: usize = 1_000_000;
 
 /// What is simulated and how an episode runs. The default is the paper's (§7) as `evaluation` plays it.
 #[derive(Clone, PartialEq, Debug, Serialize, Deserialize, DocumentedFieldsOpt)]
@@ -94,7 +94,7 @@ impl TaskConfig {
         }
         for (name, steps) in [("ragdoll_steps", self.ragdoll_steps), ("episode_steps", self.episode_steps)] {
             if steps > MOST_STEPS {
-                return Err(ConfigError::TooManySteps { name, steps });
+                return Err(ConfigError::TooManySteps { name, steps, most: MOST_STEPS });
             }
         }
         Ok(())

@@ -2,7 +2,6 @@
 //! What goes wrong inside one is [`Divergence`](crate::Divergence).
 
 use crate::character::Character;
-use crate::config::MOST_STEPS;
 
 /// Why a world, a task or a lane could not be made or set.
 #[derive(Clone, PartialEq, Debug, thiserror::Error)]
@@ -74,12 +73,14 @@ pub enum ConfigError {
     #[error("task.episode_steps is 0; it must be at least 1 (the paper's is 250)")]
     EpisodeSteps,
     /// Phases for which no memory is.
-    #[error("task.{name} is {steps}; it must be at most {MOST_STEPS}")]
+    #[error("task.{name} is {steps}; it must be at most {most}")]
     TooManySteps {
         /// Which.
         name: &'static str,
         /// How many.
         steps: usize,
+        /// The most that there may be.
+        most: usize,
     },
     /// Weights of reset sources that no draw can follow.
     #[error("the resets' weights are {0:?}; they must be finite and at least 0, and one must be above 0")]

@@ -4,7 +4,7 @@ use crate::common::{Replay, Writer, config, eventually, hello, message, next, op
 use crate::fixtures::{Ending, Part, segment, spec};
 use getup_proto::v1::append_request::Message;
 use getup_proto::{RunSpec, Segment, columns, v1};
-use getup_replay::{LocalSource, MinibatchSource, ReplayConfig, describe};
+use getup_replay::{ItemSelector, LocalSource, MinibatchSource, Remover, ReplayConfig, describe};
 use std::time::{Duration, Instant};
 use tonic::Code;
 
@@ -257,7 +257,9 @@ fn describe_tells_sizes_counters_limiter_and_writers() {
 
 #[test]
 fn metrics_follow_what_is_appended_and_sampled() {
-    let replay = Replay::start(spec(8), &config());
+    let sampler = ItemSelector::Prioritized { exponent: 1.0 };
+    let remover = Remover::LowestPriority { window: 2 };
+    let replay = Replay::start(spec(8), &ReplayConfig { sampler, remover, ..config() });
     replay.store.append((1..=10).map(|i| segment(&replay.spec, 1, i, 8)).collect()).unwrap();
     let mut source =
         LocalSource::new(replay.store.clone(), options(16), "learner", replay.shutdown.clone()).unwrap();
@@ -271,6 +273,7 @@ fn metrics_follow_what_is_appended_and_sampled() {
             + metric.get_histogram().get_sample_count() as f64
     };
     assert_eq!((value("transitions"), value("capacity_transitions")), (80.0, 10_000.0));
+    assert_eq!((value("log_transitions"), value("log_capacity_transitions")), (80.0, 20_000.0));
     assert_eq!((value("env_steps_total"), value("inserted_transitions_total")), (80.0, 80.0));
     assert_eq!((value("sampled_transitions_total"), value("episodes_total")), (16.0, 0.0));
     assert_eq!((value("append_seconds"), value("sample_seconds"), value("commit_segments")), (1.0, 1.0, 1.0));
