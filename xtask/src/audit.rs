@@ -48,6 +48,8 @@ fn install() -> Result<PathBuf> {
     println!("Building {wanted} into {} (some minutes, once)", folder.display());
     let mut command = cargo();
     command.args(["install", "--quiet", "--locked", "--debug", "--root"]).arg(&folder);
+    // In a folder that goes with it.
+    command.env_remove("CARGO_TARGET_DIR");
     run(command.arg(format!("cargo-deny@{CARGO_DENY}")).env("CARGO_PROFILE_DEV_DEBUG", "false"))?;
     Ok(program)
 }

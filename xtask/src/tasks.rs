@@ -11,8 +11,11 @@ use crate::native::{self, peers_python, readers_python, reverb_python, root, run
 /// Cargo, in the root of the repository.
 pub(crate) fn cargo() -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    // Where what is built is looked for, whatever the user's own settings say.
-    command.current_dir(root()).env("CARGO_TARGET_DIR", root().join("target"));
+    // What is built is looked for in target/release, whatever the user's own settings say.
+    command
+        .current_dir(root())
+        .env("CARGO_TARGET_DIR", root().join("target"))
+        .env_remove("CARGO_BUILD_TARGET");
     // Cargo gave this process the paths that held before it wrote them anew: let the next one read the file.
     for (name, _) in native::BUILD_VARIABLES {
         command.env_remove(name);
