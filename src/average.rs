@@ -9,8 +9,8 @@ use crate::output::write_file;
 
 /// What an evaluation said of one of them it did not say of their mean.
 const OF_ONE: &str = "evaluation_";
-/// What their mean is played with, and they have to have in common.
-const OF_ALL: [&str; 3] = ["beta", "character", "physics_hz"];
+/// What their mean is played with, and they have to have in common; each with what holds where a model does not say.
+const OF_ALL: [(&str, &str); 3] = [("beta", "not said"), ("character", "standard"), ("physics_hz", "200")];
 
 /// Average the weights of models of one ancestor into one model.
 ///
@@ -31,9 +31,9 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let policies: Vec<Policy> = arguments.models.iter().map(load).collect::<Result<_>>()?;
     let first = &policies[0].metadata;
     for (path, policy) in arguments.models.iter().zip(&policies) {
-        for key in OF_ALL {
-            let named = |value: Option<&String>| value.map_or_else(|| "not said".to_owned(), String::clone);
-            let (own, others) = (named(policy.metadata.get(key)), named(first.get(key)));
+        for (key, unsaid) in OF_ALL {
+            let own = policy.metadata.get(key).map_or(unsaid, String::as_str);
+            let others = first.get(key).map_or(unsaid, String::as_str);
             ensure!(
                 own == others,
                 "{}: its {key} is {own}, and that of {} is {others}: average models of one {key}",

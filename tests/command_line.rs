@@ -162,6 +162,11 @@ fn models_of_one_ancestor_are_averaged_into_one_that_is_evaluated() {
 
     let wider = ["--run", "wider", "--steps", "600", "--set", "sac.hidden=[8, 8]"];
     succeed(&mut train(folder.path(), &wider));
+    // Models of before did not say their physics rate, which was 200.
+    let mut old = getup_policy::Policy::load(folder.path().join(b)).unwrap();
+    assert_eq!(old.metadata.remove("physics_hz").as_deref(), Some("200"));
+    std::fs::write(folder.path().join("old.safetensors"), old.to_bytes()).unwrap();
+    succeed(&mut average(&["old.safetensors", c], "old-and-new.safetensors"));
     let weaker = ["--run", "weaker", "--from", "a/models/last.safetensors", "--steps", "1"];
     let fixed = ["--set", "curriculum.fixed=true", "--set", "curriculum.beta_start=0.5"];
     succeed(train(folder.path(), &weaker).args(fixed));

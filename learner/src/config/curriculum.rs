@@ -13,7 +13,8 @@ pub struct CurriculumConfig {
     pub beta_start: f64,
     /// β never goes under it.
     pub beta_floor: f64,
-    /// β stays at `beta_start` (in a run that is resumed, at what it has come to): no evaluation promotes, and `best` is the one with the most falls that end standing.
+    /// β stays at `beta_start` (in a run that is resumed, at what it has come to): no evaluation promotes, and `best` is the
+    /// one with the most falls that end standing.
     pub fixed: bool,
     /// Env steps without a better evaluation that end the training of a fixed β; 0 for no end.
     pub patience: u64,
