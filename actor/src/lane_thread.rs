@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use getup_proto::Segment;
 use getup_sim::TaskConfig;
-use getup_telemetry::{Shutdown, WaitGuard, Waits};
+use getup_telemetry::{Shutdown, Waits};
 use tokio::runtime::Handle;
 use tokio::sync::{mpsc, watch};
 
@@ -56,7 +56,7 @@ impl LaneThread {
         let mut group: Option<LaneGroup> = None;
         let mut segments = Vec::new();
         let mut lease = None;
-        let mut waiting: Option<WaitGuard> = None;
+        let mut waiting = self.waits.waiting("actor");
         while !self.stop.is_triggered() {
             self.take_policy(&mut group)?;
             let desk_lease = self.desk.as_mut().and_then(|desk| desk.leases.try_recv().ok());
@@ -67,16 +67,12 @@ impl LaneThread {
             let obstacle = self.obstacle(group.as_ref(), pending);
             match (obstacle, &mut group) {
                 (None, Some(group)) => {
-                    waiting = None;
+                    waiting.over();
                     group.step(&mut segments);
                     pending.extend(segments.drain(..));
                 }
                 (obstacle, _) => {
-                    let reason = obstacle.unwrap_or_else(|| "no policy from the learner yet".to_owned());
-                    match &waiting {
-                        Some(guard) => guard.set_reason(reason),
-                        None => waiting = Some(self.waits.begin("actor", reason)),
-                    }
+                    waiting.because(obstacle.unwrap_or_else(|| "no policy from the learner yet".to_owned()));
                     lease = runtime.block_on(self.change(!pending.is_empty()));
                 }
             }

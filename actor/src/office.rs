@@ -118,6 +118,7 @@ impl<'a, L: LearnerLink> Office<'a, L> {
 
     async fn send_report(&self, lease: u64, episodes: Vec<EpisodeResult>) {
         let mut backoff = Backoff::new();
+        let mut waiting = self.waits.waiting("actor_report");
         loop {
             match self.link.report(lease, episodes.clone()).await {
                 Ok(Reported::Accepted) => return,
@@ -130,7 +131,7 @@ impl<'a, L: LearnerLink> Office<'a, L> {
                     return;
                 }
                 Err(LinkError::Unavailable(reason)) => {
-                    let _waiting = self.waits.begin("actor_report", reason);
+                    waiting.because(reason);
                     tokio::time::sleep(backoff.next()).await;
                 }
             }

@@ -1,7 +1,7 @@
 //! Every wait has a reason that logs, metrics and `getup status` can show: nothing hangs silently.
 //!
-//! Code that is about to wait calls [`Waits::begin`] and holds the guard meanwhile. A wait is logged after 5 s,
-//! and again each time its length has doubled; the gauge `getup_wait_seconds{what}` shows how long the longest
+//! Code that is about to wait calls [`Waits::begin`] and holds the guard meanwhile; where a wait goes on over several
+//! attempts, it holds a [`Waiting`] instead. A wait is logged after 5 s, and again each time its length has doubled; the gauge `getup_wait_seconds{what}` shows how long the longest
 //! wait of a kind has lasted, 0 where there is none.
 
 use std::collections::BTreeSet;
@@ -18,6 +18,8 @@ use prometheus::{GaugeVec, Opts, Registry};
 const FIRST_LOG: Duration = Duration::from_secs(5);
 /// How often the waits are looked through for one to log.
 const TICK: Duration = Duration::from_millis(500);
+/// How often a reason that has to be found out is brought up to date.
+const REFRESH: Duration = Duration::from_secs(1);
 
 /// One wait that is under way.
 #[derive(Clone, PartialEq, Debug)]
@@ -52,6 +54,16 @@ pub struct WaitGuard {
     id: u64,
 }
 
+/// A wait that goes on over several attempts, and its reason at each of them. It ends at the first that succeeds, or when
+/// this is dropped.
+#[derive(Debug)]
+pub struct Waiting {
+    waits: Waits,
+    what: &'static str,
+    /// The wait under way, and when its reason is old.
+    current: Option<(WaitGuard, Instant)>,
+}
+
 impl Waits {
     /// An empty table whose gauge is in `registry`, and a thread that logs long waits while the table lives.
     ///
@@ -80,6 +92,11 @@ impl Waits {
         WaitGuard { waits: self.clone(), id }
     }
 
+    /// For waits of `what` that go on over several attempts; none has begun.
+    pub fn waiting(&self, what: &'static str) -> Waiting {
+        Waiting { waits: self.clone(), what, current: None }
+    }
+
     /// What is waited for now, the longest wait first.
     pub fn current(&self) -> Vec<Wait> {
         self.table().current(Instant::now(), self.part)
@@ -97,6 +114,37 @@ impl WaitGuard {
         if let Some(entry) = self.waits.table().entries.iter_mut().find(|entry| entry.id == self.id) {
             entry.reason = reason;
         }
+    }
+}
+
+impl Waiting {
+    /// An attempt failed for this reason: the wait begins, or goes on with it.
+    pub fn because(&mut self, reason: String) {
+        let old = Instant::now() + REFRESH;
+        match &mut self.current {
+            Some((guard, at)) => {
+                guard.set_reason(reason);
+                *at = old;
+            }
+            None => self.current = Some((self.waits.begin(self.what, reason), old)),
+        }
+    }
+
+    /// The same for attempts that follow each other fast: the reason is asked for at the beginning, and once a second.
+    pub fn because_with(&mut self, reason: impl FnOnce() -> String) {
+        if self.current.as_ref().is_none_or(|(_, old)| Instant::now() >= *old) {
+            self.because(reason());
+        }
+    }
+
+    /// An attempt succeeded.
+    pub fn over(&mut self) {
+        self.current = None;
+    }
+
+    /// Whether a wait is under way.
+    pub fn is_under_way(&self) -> bool {
+        self.current.is_some()
     }
 }
 
@@ -243,6 +291,27 @@ mod tests {
         drop(first);
         assert_eq!(waits.current()[0].what, "sampler");
         drop(second);
+        assert!(waits.current().is_empty());
+    }
+
+    #[test]
+    fn a_wait_over_several_attempts_is_one_wait_with_the_last_reason() {
+        let waits = Waits::new(&Registry::new());
+        let mut waiting = waits.waiting("actor_writer");
+        assert!(waits.current().is_empty() && !waiting.is_under_way());
+        waiting.because("replay refused the connection".into());
+        thread::sleep(Duration::from_millis(20));
+        waiting.because("replay has not acknowledged".into());
+        let [wait] = &waits.current()[..] else { panic!("{:?}", waits.current()) };
+        assert_eq!(wait.reason, "replay has not acknowledged");
+        assert!(wait.seconds >= 0.02, "{wait}");
+        waiting.because_with(|| unreachable!("the reason is not a second old"));
+        assert!(waiting.is_under_way());
+        waiting.over();
+        assert!(waits.current().is_empty());
+        waiting.because_with(|| "replay is full".into());
+        assert_eq!(waits.current()[0].reason, "replay is full");
+        drop(waiting);
         assert!(waits.current().is_empty());
     }
 
