@@ -3,10 +3,9 @@
 use std::collections::BTreeMap;
 
 use getup_policy::squash;
+use getup_proto::names::{BETA_FLOOR_VALUE, BETA_STD_VALUE};
 use rand::Rng;
 use rand_distr::StandardNormal;
-
-use crate::link::{BETA_FLOOR_VALUE, BETA_STD_VALUE};
 
 /// The draw of an episode's torque limit β̂ around the curriculum's β^i (§5).
 #[derive(Clone, Copy, PartialEq, Debug)]

@@ -9,23 +9,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use getup_policy::{ModelError, Policy};
+use getup_proto::names::{
+    BETA_FLOOR_VALUE, BETA_STD_VALUE, BETA_VALUE, FALLS_SCENARIO, HIGH_STARTS_VALUE, POLICY_NETWORK,
+};
 use getup_proto::{PolicyVersion, Segment, v1};
 use thiserror::Error;
 use tokio::sync::watch;
-
-/// The network that acts, among those of an update.
-pub const POLICY_NETWORK: &str = "policy";
-/// The named value that holds the curriculum's β^i.
-pub const BETA_VALUE: &str = "beta";
-/// The named values that hold the standard deviation of β̂ around β^i, and its floor; where one is absent, an actor goes by its
-/// own configuration.
-pub const BETA_STD_VALUE: &str = "beta_std";
-/// See [`BETA_STD_VALUE`].
-pub const BETA_FLOOR_VALUE: &str = "beta_floor";
-/// The named value that holds the share of episodes that begin high; none where it is absent.
-pub const HIGH_STARTS_VALUE: &str = "high_starts";
-/// The evaluation scenario of the get-up task: falls that their seeds alone determine.
-pub const FALLS_SCENARIO: &str = "falls";
 
 /// Everything an actor needs to act.
 #[derive(Clone, PartialEq, Debug)]
@@ -57,12 +46,8 @@ pub struct Lease {
     pub id: u64,
     /// The policy to evaluate.
     pub update: Arc<PolicyUpdate>,
-    /// [`FALLS_SCENARIO`].
-    pub scenario: String,
     /// One an episode.
     pub seeds: Vec<u64>,
-    /// Without a heartbeat for this long, the lease goes to somebody else.
-    pub keep_alive: Duration,
 }
 
 /// Why a policy update or a lease from the wire cannot be used.
@@ -195,8 +180,8 @@ impl Lease {
     /// [`UpdateError`] with the first thing that is wrong.
     pub fn parse(wire: v1::EvaluationLease) -> Result<Self, UpdateError> {
         let (id, keep_alive_seconds) = (wire.id, wire.keep_alive_seconds);
-        let keep_alive = Duration::try_from_secs_f64(keep_alive_seconds).unwrap_or_default();
-        if id == 0 || keep_alive.is_zero() {
+        let keeps_alive = Duration::try_from_secs_f64(keep_alive_seconds).is_ok_and(|time| !time.is_zero());
+        if id == 0 || !keeps_alive {
             return Err(UpdateError::Lease { id, keep_alive_seconds });
         }
         if wire.scenario != FALLS_SCENARIO {
@@ -204,7 +189,7 @@ impl Lease {
         }
         let policy = wire.policy.ok_or(UpdateError::NoPolicy(id))?;
         let update = Arc::new(PolicyUpdate::parse(policy)?);
-        Ok(Self { id, update, scenario: wire.scenario, seeds: wire.seeds, keep_alive })
+        Ok(Self { id, update, seeds: wire.seeds })
     }
 }
 
@@ -384,11 +369,13 @@ mod tests {
             keep_alive_seconds: 10.0,
         };
         let lease = Lease::parse(wire.clone()).unwrap();
-        assert_eq!((lease.id, lease.seeds, lease.keep_alive), (3, vec![1, 2], Duration::from_secs(10)));
+        assert_eq!((lease.id, lease.seeds), (3, vec![1, 2]));
         let other = v1::EvaluationLease { scenario: "walks".into(), ..wire.clone() };
         assert!(Lease::parse(other).unwrap_err().to_string().contains("asks for \"walks\""));
         assert!(Lease::parse(v1::EvaluationLease { id: 0, ..wire.clone() }).is_err());
         assert!(Lease::parse(v1::EvaluationLease { policy: None, ..wire.clone() }).is_err());
-        assert!(Lease::parse(v1::EvaluationLease { keep_alive_seconds: -1.0, ..wire }).is_err());
+        for keep_alive_seconds in [-1.0, 0.0, f64::NAN] {
+            assert!(Lease::parse(v1::EvaluationLease { keep_alive_seconds, ..wire.clone() }).is_err());
+        }
     }
 }

@@ -7,10 +7,10 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use getup_actor::link::{BETA_VALUE, HIGH_STARTS_VALUE, POLICY_NETWORK};
 use getup_learner::hub::Hub;
 use getup_learner::service::service;
 use getup_policy::{Body, ObservationStatistics, Policy, PolicyShape};
+use getup_proto::names::{BETA_VALUE, HIGH_STARTS_VALUE, POLICY_NETWORK};
 use getup_proto::{PolicyVersion, v1};
 use getup_replay::{MinibatchSource, RemoteOptions, SampleError, SampleOptions, ShardedSource};
 use getup_telemetry::{Registry, Shutdown, Waits, health};
@@ -34,17 +34,16 @@ pub(crate) fn run(replay: &str, broadcasts: f64, minibatches: f64) -> Result<()>
     work_until(&shutdown, async {
         let hub = Arc::new(hub());
         let listener = listen().await?;
-        let (_reporter, health) = health();
-        let routes = Routes::new(health).add_service(service(Arc::clone(&hub), shutdown.clone()));
+        let routes =
+            Routes::new(health(shutdown.clone())).add_service(service(Arc::clone(&hub), shutdown.clone()));
         let sampled = Arc::new(AtomicU64::new(0));
         let source = source(replay, &shutdown);
         let (count, ended) = (Arc::clone(&sampled), shutdown.clone());
         thread::spawn(move || publish(&hub, broadcasts, &ended));
         let ended = shutdown.clone();
         thread::spawn(move || sample(source, minibatches, &count, &ended));
-        let ended = shutdown.clone();
         let limits = Limits { window: Window::Adaptive, ..Limits::default() };
-        let serving = port(limits).serve(listener, routes, async move { ended.wait().await });
+        let serving = port(limits).serve(listener, routes, shutdown.clone());
         let mut since = Instant::now();
         let counts = || {
             let minibatches = sampled.swap(0, Ordering::Relaxed) as f64 / since.elapsed().as_secs_f64();

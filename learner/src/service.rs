@@ -29,13 +29,11 @@ pub fn service(hub: Arc<Hub>, shutdown: Shutdown) -> LearnerServer<impl Learner>
 
 impl From<HubError> for Status {
     fn from(error: HubError) -> Self {
-        let message = error.to_string();
         match error {
-            HubError::Spec(_) | HubError::Lease(LeaseError::NotHeld(_)) => {
-                Status::failed_precondition(message)
-            }
+            HubError::Spec(error) => error.into(),
+            HubError::Lease(LeaseError::NotHeld(_)) => Status::failed_precondition(error.to_string()),
             HubError::Lease(LeaseError::Episodes { .. }) | HubError::Malformed(_) => {
-                Status::invalid_argument(message)
+                Status::invalid_argument(error.to_string())
             }
         }
     }
@@ -50,8 +48,8 @@ impl Learner for Service {
         request: Request<v1::SubscribeRequest>,
     ) -> Result<Response<Self::SubscribeStream>, Status> {
         let request = request.into_inner();
-        let spec = request.spec.ok_or_else(|| Status::invalid_argument("the subscription names no spec"))?;
-        let policies = WatchStream::new(self.hub.subscribe(&parse(spec)?)?);
+        let spec = request.spec.ok_or(SpecError::Missing).and_then(RunSpec::parse)?;
+        let policies = WatchStream::new(self.hub.subscribe(&spec)?);
         tracing::info!(actor = request.actor, "actor subscribed");
         let updates = policies
             // The state before the first policy is not a policy.
@@ -68,7 +66,7 @@ impl Learner for Service {
     ) -> Result<Response<v1::HeartbeatReply>, Status> {
         let mut request = request.into_inner();
         if let Some(spec) = request.spec.take() {
-            self.hub.check(&parse(spec)?)?;
+            self.hub.check(&RunSpec::parse(spec)?)?;
         }
         Ok(Response::new(self.hub.heartbeat(request, now())?))
     }
@@ -84,13 +82,6 @@ impl Learner for Service {
     async fn status(&self, _: Request<v1::StatusRequest>) -> Result<Response<v1::StatusReply>, Status> {
         Ok(Response::new(self.hub.status(now())))
     }
-}
-
-fn parse(spec: v1::RunSpec) -> Result<RunSpec, Status> {
-    RunSpec::parse(spec).map_err(|error| match error {
-        SpecError::Protocol { .. } => Status::failed_precondition(error.to_string()),
-        malformed => Status::invalid_argument(malformed.to_string()),
-    })
 }
 
 /// By the clock of the runtime, which a simulation moves.

@@ -6,9 +6,11 @@
 //!   so that nothing behind the door checks again.
 //! - [`TraceContext`] names a place in a trace, which crosses beside what is followed.
 //! - [`columns`] turns `f32` values into the little-endian bytes of a column, and back.
+//! - [`names`] are those of networks, values and scenarios inside messages.
 //! - [`PolicyVersion`] orders the policies of a run.
 
 pub mod columns;
+pub mod names;
 mod segment;
 mod spec;
 mod trace;

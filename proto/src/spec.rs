@@ -43,7 +43,7 @@ pub struct ColumnSpec {
 pub struct RunSpec {
     /// The run's name.
     pub run: String,
-    /// Who produces the columns, as `task/character`.
+    /// Who produces the columns: the task and what of it shapes a transition, each after a `/`.
     pub task: String,
     /// The columns of a segment, in this order.
     pub columns: Vec<ColumnSpec>,
@@ -122,6 +122,18 @@ pub enum SpecError {
         /// As it came.
         theirs: String,
     },
+}
+
+/// A peer of another run, or of another version, is not at fault by itself: what it asks for has no place here.
+impl From<SpecError> for tonic::Status {
+    fn from(error: SpecError) -> Self {
+        match error {
+            SpecError::Protocol { .. } | SpecError::Differs { .. } => {
+                Self::failed_precondition(error.to_string())
+            }
+            malformed => Self::invalid_argument(malformed.to_string()),
+        }
+    }
 }
 
 /// The widest column, in values.

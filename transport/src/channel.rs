@@ -17,7 +17,7 @@ use tokio_util::either::Either;
 use tonic::service::Interceptor;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::Endpoint;
-use tonic::{Request, Status};
+use tonic::{Code, Request, Status};
 use tower::ServiceExt;
 
 use crate::network::{DynStream, Network};
@@ -224,6 +224,22 @@ pub fn reason(status: &Status) -> String {
     match status.source().map(root_cause) {
         Some(cause) if !said.contains(&cause) => format!("{said}: {cause}"),
         _ => said.to_owned(),
+    }
+}
+
+/// Whether a call that failed so would fail again, so that another attempt is not worth while. `admitted`: whether the peer
+/// has let this role in before. Then a token that it does not know is one that reaches the two of them at different times.
+pub fn is_final(status: &Status, admitted: bool) -> bool {
+    match status.code() {
+        Code::Unauthenticated => !admitted,
+        // A message that is longer than the other side takes is out of range.
+        Code::InvalidArgument
+        | Code::FailedPrecondition
+        | Code::NotFound
+        | Code::OutOfRange
+        | Code::PermissionDenied
+        | Code::Unimplemented => true,
+        _ => false,
     }
 }
 

@@ -35,7 +35,7 @@ mod tls;
 pub mod token;
 
 pub use certs::{CertsError, Issued, make_authority};
-pub use channel::{Bearer, Channel, ChannelOptions, Window, reason};
+pub use channel::{Bearer, Channel, ChannelOptions, Window, is_final, reason};
 pub use config::{SecurityConfig, require_protection};
 pub use credentials::Credentials;
 pub use endpoint::Endpoint;

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use getup_proto::v1::learner_client::LearnerClient;
 use getup_proto::v1::{self, SubscribeRequest};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec};
-use getup_telemetry::{Backoff, WaitGuard, Waits};
+use getup_telemetry::{Backoff, Waiting, Waits};
 use getup_transport::{AddressError, Channel, ChannelOptions, Endpoint};
 use tonic::{Code, Status};
 
@@ -51,7 +51,7 @@ impl GrpcLearner {
         &self,
         slot: &PolicySlot,
         backoff: &mut Backoff,
-        waiting: &mut Option<WaitGuard>,
+        waiting: &mut Waiting,
     ) -> Result<(), LinkError> {
         let error = |status: Status| self.error(&status);
         let request = SubscribeRequest { spec: Some(self.spec.to_wire()), actor: self.name.clone() };
@@ -63,7 +63,7 @@ impl GrpcLearner {
                 .map_err(|error| LinkError::Refused(format!("{}: {error}", self.peer)))?;
             slot.send_replace(Some(Arc::new(update)));
             backoff.reset();
-            *waiting = None;
+            waiting.over();
         }
         Err(LinkError::Unavailable(format!("{}: it ended the stream", self.peer)))
     }
@@ -85,17 +85,14 @@ impl GrpcLearner {
 impl LearnerLink for GrpcLearner {
     async fn subscribe(&self, slot: PolicySlot) -> Result<(), LinkError> {
         let mut backoff = Backoff::new();
-        let mut waiting = None;
+        let mut waiting = self.waits.waiting("actor_link");
         loop {
             let error = match self.hear(&slot, &mut backoff, &mut waiting).await {
                 Err(LinkError::Unavailable(reason)) => reason,
                 ended => return ended,
             };
             tracing::debug!("no policies from the {error}");
-            match &waiting {
-                Some(guard) => guard.set_reason(error),
-                None => waiting = Some(self.waits.begin("actor_link", error)),
-            }
+            waiting.because(error);
             tokio::time::sleep(backoff.next()).await;
         }
     }

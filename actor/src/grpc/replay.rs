@@ -4,7 +4,7 @@ use getup_proto::v1::append_request::Message;
 use getup_proto::v1::replay_client::ReplayClient;
 use getup_proto::v1::{AppendHello, AppendReply, AppendRequest};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, Segment};
-use getup_telemetry::{Backoff, WaitGuard, Waits};
+use getup_telemetry::{Backoff, Waits};
 use getup_transport::{AddressError, Channel, ChannelOptions, Endpoint};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::UnboundedReceiverStream;
@@ -128,7 +128,7 @@ impl SegmentWriter for GrpcReplay {
     }
 
     async fn append(&mut self, segments: Vec<Segment>) -> Result<(), LinkError> {
-        let mut waiting: Option<WaitGuard> = None;
+        let mut waiting = self.waits.waiting("actor_writer");
         loop {
             let error = match self.attempt(&segments).await {
                 Ok(()) => {
@@ -139,10 +139,7 @@ impl SegmentWriter for GrpcReplay {
             };
             let LinkError::Unavailable(reason) = error else { return Err(error) };
             tracing::debug!("cannot append to the {reason}");
-            match &waiting {
-                Some(guard) => guard.set_reason(reason),
-                None => waiting = Some(self.waits.begin("actor_writer", reason)),
-            }
+            waiting.because(reason);
             tokio::time::sleep(self.backoff.next()).await;
         }
     }

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use getup_policy::Policy;
+use getup_proto::names::{BETA_FLOOR_VALUE, BETA_STD_VALUE, BETA_VALUE, HIGH_STARTS_VALUE, POLICY_NETWORK};
 use getup_proto::v1;
 
 use super::{Ending, TrainError, Trainer};
@@ -29,12 +30,12 @@ impl Trainer {
     fn broadcast(&mut self, policy: &Policy, finished: bool) -> Arc<v1::PolicyUpdate> {
         let update = Arc::new(v1::PolicyUpdate {
             version: Some(self.version.into()),
-            networks: vec![v1::NamedNetwork { name: "policy".into(), model: policy.to_bytes().into() }],
+            networks: vec![v1::NamedNetwork { name: POLICY_NETWORK.into(), model: policy.to_bytes().into() }],
             values: [
-                ("beta".to_owned(), self.curriculum.beta()),
-                ("beta_std".to_owned(), self.config.curriculum.beta_std),
-                ("beta_floor".to_owned(), self.config.curriculum.beta_floor),
-                ("high_starts".to_owned(), self.curriculum.high_starts()),
+                (BETA_VALUE.to_owned(), self.curriculum.beta()),
+                (BETA_STD_VALUE.to_owned(), self.config.curriculum.beta_std),
+                (BETA_FLOOR_VALUE.to_owned(), self.config.curriculum.beta_floor),
+                (HIGH_STARTS_VALUE.to_owned(), self.curriculum.high_starts()),
             ]
             .into(),
             stage: self.curriculum.stage(),
