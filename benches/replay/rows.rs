@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 use getup_proto::RunSpec;
-use getup_replay::{SampleOptions, Sampler, SyncMode, describe, take_snapshot};
+use getup_replay::{SampleOptions, SyncMode, describe, take_snapshot};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::json;
@@ -158,7 +158,7 @@ pub(crate) fn in_process_row(dir: &Path) -> Result<Row> {
     const BATCH: usize = 256;
     let store = open(dir, SyncMode::Process)?;
     let options = SampleOptions { batch: BATCH, n_step: 1, gamma: 0.97, seed: 1, segments: false };
-    let mut sampler = Sampler::new(1);
+    let mut draws = ChaCha8Rng::seed_from_u64(1);
     let flat = vec![0.5f32; FULL * VALUES];
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     // Places of the columns in a row, and once more the observation: the one that follows.
@@ -167,7 +167,7 @@ pub(crate) fn in_process_row(dir: &Path) -> Result<Row> {
     for turn in 0..2 * TURNS {
         let mut our_turn = || {
             per_second(BATCH, || {
-                black_box(store.try_sample(&mut sampler, &options)?.context("the store has transitions")?);
+                black_box(store.try_sample(&mut draws, &options)?.context("the store has transitions")?);
                 Ok(())
             })
         };

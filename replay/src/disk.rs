@@ -4,8 +4,6 @@ use crate::log::disk_bytes;
 use getup_telemetry::prometheus::core::{Collector, Desc};
 use getup_telemetry::prometheus::proto::MetricFamily;
 use getup_telemetry::prometheus::{IntGauge, Opts};
-use std::ffi::CString;
-use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
@@ -63,14 +61,8 @@ impl Collector for Disk {
 
 /// Bytes that are free to this process, and all, of the disk that `dir` lies on.
 fn space(dir: &Path) -> Option<(u64, u64)> {
-    let path = CString::new(dir.as_os_str().as_bytes()).ok()?;
-    // SAFETY: an all-zero statvfs is a valid value of that plain structure, `path` is NUL-terminated, and the call writes
-    // to nothing else.
-    let (result, facts) = unsafe {
-        let mut facts: libc::statvfs = std::mem::zeroed();
-        (libc::statvfs(path.as_ptr(), &raw mut facts), facts)
-    };
-    (result == 0).then(|| (facts.f_bavail * facts.f_frsize, facts.f_blocks * facts.f_frsize))
+    let facts = rustix::fs::statvfs(dir).ok()?;
+    Some((facts.f_bavail * facts.f_frsize, facts.f_blocks * facts.f_frsize))
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@
 
 use crate::limiter::{Blocked, Limiter};
 use getup_proto::Segment;
-use getup_telemetry::{Shutdown, WaitGuard, Waits};
+use getup_telemetry::{Shutdown, Waiting, Waits};
 use std::collections::HashMap;
 use std::fmt::Write;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -12,9 +12,9 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
 /// How often a wait looks whether it was cancelled.
-const CANCEL_TICK: Duration = Duration::from_millis(50);
+pub(crate) const CANCEL_TICK: Duration = Duration::from_millis(50);
 /// How often a wait's reason is brought up to date.
-const REASON_TICK: Duration = Duration::from_secs(1);
+pub(crate) const REASON_TICK: Duration = Duration::from_secs(1);
 /// A peer that was silent for this long is named in the reason.
 const SILENCE: Duration = Duration::from_secs(3);
 /// Peers that are remembered; beyond, the longest silent is forgotten.
@@ -28,6 +28,9 @@ pub(crate) struct Gate {
     moved: Condvar,
     /// The same for tasks.
     moved_tasks: watch::Sender<()>,
+    /// Held by the task of a writer that waits for room. The others wait for this, in the order in which they came: else each
+    /// step of the limiter would wake a thousand, for one of them to find room.
+    turn: tokio::sync::Mutex<()>,
     waits: Waits,
 }
 
@@ -63,14 +66,17 @@ impl Drop for Permit {
     }
 }
 
-/// A wait under way, and when its reason was brought up to date.
-pub(crate) type Waiting = Option<(WaitGuard, Instant)>;
-
 impl Gate {
     pub(crate) fn new(limiter: Limiter, waits: Waits) -> Arc<Self> {
         let inner = Inner { limiter, writers: HashMap::new(), samplers: HashMap::new() };
         let (moved_tasks, _) = watch::channel(());
-        Arc::new(Self { inner: Mutex::new(inner), moved: Condvar::new(), moved_tasks, waits })
+        Arc::new(Self {
+            inner: Mutex::new(inner),
+            moved: Condvar::new(),
+            moved_tasks,
+            turn: tokio::sync::Mutex::default(),
+            waits,
+        })
     }
 
     /// What the limiter says now.
@@ -93,21 +99,17 @@ impl Gate {
         self.wake();
     }
 
-    /// Counts a sample, if it need not wait; `count` is told the new total before anybody else can sample.
-    pub(crate) fn try_sample<E>(
-        &self,
-        batch: u64,
-        count: impl FnOnce(u64) -> Result<(), E>,
-    ) -> Result<bool, E> {
+    /// Counts a sample, if it need not wait; the new total.
+    pub(crate) fn try_sample(&self, batch: u64) -> Option<u64> {
         let mut inner = self.lock();
         if inner.limiter.blocks_sample(batch).is_some() {
-            return Ok(false);
+            return None;
         }
-        count(inner.limiter.samples() + batch)?;
         inner.limiter.sample(batch);
+        let total = inner.limiter.samples();
         drop(inner);
         self.wake();
-        Ok(true)
+        Some(total)
     }
 
     /// Notes how many draws are left.
@@ -115,7 +117,12 @@ impl Gate {
         self.lock().limiter.set_available(available);
     }
 
-    /// Waits until a sample of this size might be let through; `wait` goes on over several calls. False when `cancelled` or `patience` ends the wait.
+    /// For waits of a sampler, over several calls of [`Gate::wait_to_sample`].
+    pub(crate) fn sampler_waiting(&self) -> Waiting {
+        self.waits.waiting("sampler")
+    }
+
+    /// Waits until a sample of this size might be let through. False when `cancelled` or `patience` ends the wait.
     pub(crate) fn wait_to_sample(
         &self,
         batch: u64,
@@ -155,7 +162,7 @@ impl Gate {
         if matches!(blocked, Blocked::Consumed { .. }) && inner.limiter.want(batch) {
             self.wake_tasks();
         }
-        self.explain(wait, "sampler", || inner.reason(blocked, &inner.writers));
+        wait.because_with(|| inner.reason(blocked, &inner.writers));
     }
 
     /// Room for an insert, if it need not wait.
@@ -166,30 +173,38 @@ impl Gate {
 
     /// Waits for room for an insert, on a thread. None when `shutdown` ends the wait.
     pub(crate) fn admit(self: &Arc<Self>, env_steps: u64, shutdown: &Shutdown) -> Option<Permit> {
-        let mut wait = None;
+        let mut wait = self.waits.waiting("writer");
         let mut inner = self.lock();
         while let Err(blocked) = inner.try_admit(env_steps) {
             if shutdown.is_triggered() {
                 return None;
             }
-            self.explain(&mut wait, "writer", || inner.reason(&blocked, &inner.samplers));
+            wait.because_with(|| inner.reason(&blocked, &inner.samplers));
             inner = self.moved.wait_timeout(inner, CANCEL_TICK).unwrap_or_else(PoisonError::into_inner).0;
         }
         drop(inner);
         Some(Permit { gate: self.clone(), env_steps })
     }
 
-    /// Waits for room for an insert, in a task that whoever shuts down drops.
+    /// Waits for room for an insert, in a task that whoever shuts down drops; in turn with others.
     pub(crate) async fn admit_task(self: &Arc<Self>, env_steps: u64) -> Permit {
+        let mut wait = self.waits.waiting("writer");
+        let turn = self.turn.lock();
+        tokio::pin!(turn);
+        let _turn = loop {
+            match tokio::time::timeout(REASON_TICK, &mut turn).await {
+                Ok(turn) => break turn,
+                Err(_) => wait.because_with(|| self.why_writers_wait(env_steps)),
+            }
+        };
         let mut moved = self.moved_tasks.subscribe();
-        let mut wait = None;
         loop {
             {
                 let mut inner = self.lock();
                 match inner.try_admit(env_steps) {
                     Ok(()) => return Permit { gate: self.clone(), env_steps },
                     Err(blocked) => {
-                        self.explain(&mut wait, "writer", || inner.reason(&blocked, &inner.samplers));
+                        wait.because_with(|| inner.reason(&blocked, &inner.samplers));
                     }
                 }
             }
@@ -244,15 +259,10 @@ impl Gate {
         self.waits.current().first().map_or_else(String::new, ToString::to_string)
     }
 
-    fn explain(&self, wait: &mut Waiting, what: &'static str, reason: impl FnOnce() -> String) {
-        match wait {
-            Some((_, updated)) if updated.elapsed() < REASON_TICK => {}
-            Some((guard, updated)) => {
-                guard.set_reason(reason());
-                *updated = Instant::now();
-            }
-            None => *wait = Some((self.waits.begin(what, reason()), Instant::now())),
-        }
+    fn why_writers_wait(&self, env_steps: u64) -> String {
+        let inner = self.lock();
+        let blocked = inner.limiter.blocks_insert(env_steps);
+        blocked.map_or_else(|| "its turn".to_owned(), |blocked| inner.reason(&blocked, &inner.samplers))
     }
 
     fn wake(&self) {
@@ -307,6 +317,60 @@ fn came(peers: &mut HashMap<u64, Peer>, id: u64, name: &str, durable: u64) {
             peers.iter().filter(|(_, peer)| peer.connections == 0).min_by_key(|(_, peer)| peer.heard);
         if let Some(id) = silent.map(|(&id, _)| id) {
             peers.remove(&id);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{ReplayConfig, fixtures};
+    use getup_telemetry::Registry;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::task::{Context, Poll, Wake, Waker};
+
+    /// How often a task was woken.
+    #[derive(Default)]
+    struct Woken(AtomicUsize);
+
+    impl Wake for Woken {
+        fn wake(self: Arc<Self>) {
+            self.0.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// A gate with room for three inserts of 8 env steps, and for one more after each sample of 8.
+    fn gate() -> Arc<Gate> {
+        let (min_size, samples_per_insert, error_buffer) = (8, Some(1.0), Some(16.0));
+        let config = ReplayConfig { min_size, samples_per_insert, error_buffer, ..ReplayConfig::default() };
+        Gate::new(Limiter::new(&config, &fixtures::spec(8)), Waits::new(&Registry::new()))
+    }
+
+    #[tokio::test]
+    async fn a_step_of_the_limiter_wakes_the_writer_whose_turn_it_is_alone_and_they_are_admitted_in_order() {
+        let gate = gate();
+        while let Some(permit) = gate.try_admit(8) {
+            gate.lock().limiter.insert(8);
+            drop(permit);
+        }
+        let wakers: Vec<Arc<Woken>> = (0..100).map(|_| Arc::default()).collect();
+        let mut writers: Vec<_> = wakers.iter().map(|_| Box::pin(gate.admit_task(8))).collect();
+        let mut poll = |index: usize| {
+            let waker = Waker::from(Arc::clone(&wakers[index]));
+            writers[index].as_mut().poll(&mut Context::from_waker(&waker))
+        };
+        assert!((0..100).all(|index| poll(index).is_pending()));
+        let woken = || wakers.iter().map(|woken| woken.0.load(Ordering::Relaxed)).collect::<Vec<_>>();
+        for admitted in 0..5 {
+            assert!(gate.try_sample(8).is_some());
+            // The next one has its turn as soon as the one before is through.
+            let Poll::Ready(permit) = poll(admitted) else {
+                panic!("{admitted} is not admitted: {:?}", woken())
+            };
+            gate.lock().limiter.insert(8);
+            drop(permit);
+            assert!(woken()[admitted + 2..].iter().all(|woken| *woken == 0), "{:?}", woken());
+            assert!(poll(admitted + 1).is_pending(), "there is room for one");
         }
     }
 }

@@ -2,10 +2,11 @@ use super::*;
 use crate::config::ReplayConfig;
 use crate::fixtures::{self, Ending, Part};
 use crate::remover::Remover;
-use crate::sampler::Sampler;
 use crate::selector::ItemSelector;
 use getup_proto::Segment;
 use proptest::prelude::*;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 
 const GAMMA: f32 = 0.9;
 
@@ -159,7 +160,8 @@ fn columns_come_in_the_order_of_the_spec_then_the_next_states_then_the_discount(
         ring.push(&segment);
     }
     let options = SampleOptions { batch: 64, n_step: 1, gamma: GAMMA, seed: 0, segments: false };
-    let drawn = Sampler::new(5).draw_uniformly(&ring, options.batch);
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let drawn: Vec<_> = (0..options.batch).map(|_| ring.draw_uniformly(&mut rng)).collect();
     let columns = gather(&ring, &drawn, &options);
     let shape: Vec<_> = columns.iter().map(|c| (c.name.as_str(), c.width, c.data.len())).collect();
     let expected = [

@@ -16,7 +16,6 @@
 //! | `remover` | [`Remover`]: which segments leave a full ring: the oldest, or those of the lowest priority |
 //! | `gather` | from drawn rows to contiguous columns, with n-step returns |
 //! | `selector`, `sum_tree` | [`ItemSelector`]: which transitions are drawn: uniform, prioritized, FIFO, LIFO |
-//! | `sampler` | [`Sampler`]: whose random numbers decide |
 //! | `undrawn` | segments that are followed by traces, up to their first minibatch |
 //! | `limiter` | Reverb's cursor between two bounds, a pure state machine |
 //! | `gate` | the limiter with its doors: who waits there, and for whom |
@@ -39,7 +38,6 @@ mod minibatch;
 mod remote;
 mod remover;
 mod ring;
-mod sampler;
 mod selector;
 mod service;
 mod shards;
@@ -64,7 +62,6 @@ pub use minibatch::{
 };
 pub use remote::{RemoteOptions, RemoteSource, describe, describe_table, take_snapshot, update_priorities};
 pub use remover::Remover;
-pub use sampler::Sampler;
 pub use selector::ItemSelector;
 pub use service::{ServeError, limits, serve, serve_at};
 pub use shards::ShardedSource;

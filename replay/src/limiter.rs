@@ -87,9 +87,9 @@ impl Limiter {
     pub(crate) fn restore(&mut self, inserts: u64, samples: u64) {
         (self.inserts, self.samples, self.offset) = (inserts, samples, 0.0);
         if let Some(band) = self.band {
-            let cursor = self.cursor();
-            let min = if inserts >= self.min_size { band.min } else { f64::NEG_INFINITY };
-            self.offset = cursor.clamp(min, band.max) - cursor;
+            // The band holds nobody up before the first sample may be taken.
+            let cursor = self.cursor_at(inserts.max(self.min_size), samples);
+            self.offset = cursor.clamp(band.min, band.max) - cursor;
         }
     }
 

@@ -108,6 +108,8 @@ proptest! {
         let (_, min, max) = limiter.band().unwrap();
         let cursor = limiter.cursor();
         prop_assert!(cursor <= max + 1e-3 && (inserts < 1000 || cursor >= min - 1e-3));
+        limiter.insert(1000u64.saturating_sub(inserts));
+        prop_assert!(limiter.cursor() >= min - 1e-3 && limiter.cursor() <= max + 1e-3, "once samples may be taken");
     }
 }
 

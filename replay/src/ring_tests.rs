@@ -342,3 +342,31 @@ fn what_can_be_drawn_no_more_keeps_no_segment() {
     ring.push(&fixtures::segment(&spec, 1, 4, 4));
     assert_eq!((held(&ring), ring.available()), (vec![0, 2, 3], Some(12)));
 }
+
+/// Chi-square of `counts` against a uniform distribution, as a number of standard deviations.
+fn deviation(counts: &[u32]) -> f64 {
+    let expected = counts.iter().sum::<u32>() as f64 / counts.len() as f64;
+    let chi_square: f64 = counts.iter().map(|&n| (n as f64 - expected).powi(2) / expected).sum();
+    let freedom = (counts.len() - 1) as f64;
+    (chi_square - freedom) / (2.0 * freedom).sqrt()
+}
+
+#[test]
+fn every_transition_is_drawn_with_the_same_probability_also_after_the_ring_has_wrapped() {
+    let spec = fixtures::spec(8);
+    let mut ring = empty(&spec, 100);
+    for (i, steps) in [8, 1, 3, 8, 2, 5].into_iter().cycle().take(60).enumerate() {
+        ring.push(&fixtures::segment(&spec, 1, i as u64 + 1, steps));
+    }
+    let rows: Vec<usize> = (0..ring.rows()).map(|n| ring.nth_row(n)).collect();
+    let mut counts = vec![0; rows.iter().max().unwrap() + 1];
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    for _ in 0..200_000 {
+        counts[ring.draw_uniformly(&mut rng).slot] += 1;
+    }
+    let begin = rows.into_iter().filter(|&slot| ring.steps_from(slot) > 0);
+    let drawn: Vec<u32> = begin.map(|slot| counts[slot]).collect();
+    assert_eq!(drawn.len(), ring.len());
+    assert_eq!(drawn.iter().sum::<u32>(), 200_000);
+    assert!(deviation(&drawn).abs() < 4.0, "{} standard deviations", deviation(&drawn));
+}

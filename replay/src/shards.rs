@@ -1,16 +1,14 @@
 //! Sampling several replay services at once: [`ShardedSource`].
 
-use crate::gate::Waiting;
+use crate::gate::CANCEL_TICK;
 use crate::minibatch::Minibatch;
-use crate::remote::{Bell, REASON_TICK, RemoteOptions, RemoteSource};
+use crate::remote::{Bell, RemoteOptions, RemoteSource};
 use crate::source::{MinibatchSource, SampleError};
-use getup_telemetry::{Shutdown, Waits};
+use getup_telemetry::{Shutdown, Waiting, Waits};
 use getup_transport::Endpoint;
 use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
 
-/// How often a wait looks whether it was cancelled.
-const CANCEL_TICK: Duration = Duration::from_millis(50);
 /// How long one whose turn it is may take while others are ready: a few round trips.
 const PATIENCE: Duration = Duration::from_millis(5);
 
@@ -23,7 +21,6 @@ const PATIENCE: Duration = Duration::from_millis(5);
 pub struct ShardedSource {
     shards: Vec<Shard>,
     arrivals: Bell,
-    waits: Waits,
     /// Since the last minibatch.
     wait: Waiting,
     shutdown: Shutdown,
@@ -67,7 +64,7 @@ impl ShardedSource {
             Shard { source, next: None, held: 1.0, turn: 0.0, late: true }
         };
         let shards = endpoints.iter().enumerate().map(shard).collect();
-        Self { shards, arrivals, waits, wait: None, shutdown }
+        Self { shards, arrivals, wait: waits.waiting("learner"), shutdown }
     }
 
     /// The minibatch whose turn it is; None where it has not come, and its service is not late yet.
@@ -98,12 +95,13 @@ impl ShardedSource {
             self.shards[index].late = true;
         }
     }
+}
 
-    fn reason(&self) -> String {
-        let mut reasons: Vec<String> = self.shards.iter().map(|shard| shard.source.reason()).collect();
-        reasons.dedup();
-        reasons.join("; ")
-    }
+/// Why none of them has a minibatch.
+fn reason(shards: &[Shard]) -> String {
+    let mut reasons: Vec<String> = shards.iter().map(|shard| shard.source.reason()).collect();
+    reasons.dedup();
+    reasons.join("; ")
 }
 
 /// Smooth weighted round-robin: all move on by what they hold, the one that is furthest is next and goes back by what all
@@ -119,7 +117,7 @@ impl MinibatchSource for ShardedSource {
         let started = Instant::now();
         loop {
             if let Some(minibatch) = self.take()? {
-                self.wait = None;
+                self.wait.over();
                 return Ok(Some(minibatch));
             }
             if self.shutdown.is_triggered() {
@@ -137,17 +135,7 @@ impl MinibatchSource for ShardedSource {
                 continue;
             }
             self.arrivals.wait(left.min(CANCEL_TICK));
-            match &mut self.wait {
-                None => self.wait = Some((self.waits.begin("learner", self.reason()), Instant::now())),
-                Some((_, explained)) if explained.elapsed() >= REASON_TICK => {
-                    let reason = self.reason();
-                    if let Some((guard, explained)) = &mut self.wait {
-                        guard.set_reason(reason);
-                        *explained = Instant::now();
-                    }
-                }
-                Some(_) => {}
-            }
+            self.wait.because_with(|| reason(&self.shards));
         }
     }
 

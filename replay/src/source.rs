@@ -4,11 +4,11 @@
 //! cannot tell which it has.
 
 use crate::error::StoreError;
-use crate::gate::Waiting;
 use crate::minibatch::{Minibatch, OptionsError, SampleOptions};
-use crate::sampler::Sampler;
 use crate::store::Store;
-use getup_telemetry::Shutdown;
+use getup_telemetry::{Shutdown, Waiting};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -70,7 +70,7 @@ pub enum SampleError {
 #[derive(Debug)]
 pub struct LocalSource {
     store: Arc<Store>,
-    sampler: Sampler,
+    rng: ChaCha8Rng,
     options: SampleOptions,
     shutdown: Shutdown,
     /// Among the samplers at the gate.
@@ -94,17 +94,8 @@ impl LocalSource {
         store.check_options(&options)?;
         let id = NEXT.fetch_add(1, Ordering::Relaxed);
         store.gate().sampler_came(id, name);
-        Ok(Self { store, sampler: Sampler::new(options.seed), options, shutdown, id, wait: None })
-    }
-
-    /// The sampler's state, to be saved in a checkpoint.
-    pub fn sampler(&self) -> &Sampler {
-        &self.sampler
-    }
-
-    /// Goes on with a sampler that was saved.
-    pub fn restore(&mut self, sampler: Sampler) {
-        self.sampler = sampler;
+        let (rng, wait) = (ChaCha8Rng::seed_from_u64(options.seed), store.gate().sampler_waiting());
+        Ok(Self { store, rng, options, shutdown, id, wait })
     }
 
     /// Returns when there might be a minibatch, or at the shutdown.
@@ -126,8 +117,8 @@ impl MinibatchSource for LocalSource {
             if self.shutdown.is_triggered() {
                 return Err(SampleError::Shutdown);
             }
-            if let Some(minibatch) = self.store.try_sample(&mut self.sampler, &self.options)? {
-                self.wait = None;
+            if let Some(minibatch) = self.store.try_sample(&mut self.rng, &self.options)? {
+                self.wait.over();
                 return Ok(Some(minibatch));
             }
             // Another sampler may be quicker than this one after the wait.

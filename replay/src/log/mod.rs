@@ -281,8 +281,10 @@ impl Log {
         let moved = self.writers.iter().filter(|(_, mark)| mark.segment >= self.indexed);
         self.index.write(&Content { oldest, marks: moved.collect() }, &forgotten)?;
         (self.state.oldest, self.indexed) = (oldest, self.state.segments);
-        for file in self.files.drain(..excess) {
-            files::remove(&self.dir, file.first)?;
+        for _ in 0..excess {
+            // One that stays is counted, and tried again.
+            files::remove(&self.dir, self.files[0].first)?;
+            self.files.pop_front();
         }
         Ok(())
     }

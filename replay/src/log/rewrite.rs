@@ -144,7 +144,7 @@ impl Writing<'_> {
         let marks = self.found.writers.iter().filter(|(_, mark)| mark.segment < number);
         let log = Log::begin(&self.dir, &self.found.survey.spec, &self.config, self.state, marks.collect())?;
         if let Some(sampled) = self.found.survey.sampled {
-            log.watermark().set_sampled(sampled)?;
+            log.watermark().raise_sampled(sampled)?;
         }
         self.state = log.state();
         self.log = Some(log);

@@ -104,7 +104,7 @@ impl Found {
     ) -> Result<Self, StoreError> {
         let manifest = Manifest::existing(dir)?;
         // Asked before the files are read: what is acknowledged later may be in none of them.
-        let watermark = Watermark::open(dir);
+        let watermark = Watermark::open_to_read(dir);
         let acknowledged = watermark
             .as_ref()
             .map_err(ToString::to_string)

@@ -10,6 +10,7 @@ use std::fs::{File, OpenOptions};
 use std::io;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 pub(super) const FILE: &str = "watermark";
 /// A number and its CRC-32.
@@ -23,6 +24,8 @@ const SAMPLED_AT: u64 = 4096;
 pub(crate) struct Watermark {
     file: File,
     path: PathBuf,
+    /// The most transitions that were noted as sampled since it was opened.
+    sampled: Mutex<u64>,
 }
 
 impl Watermark {
@@ -31,7 +34,7 @@ impl Watermark {
         let path = dir.join(FILE);
         let options = OpenOptions::new().read(true).write(true).create(true).truncate(true).clone();
         let file = options.open(&path).map_err(StoreError::io("create", &path))?;
-        let watermark = Self { file, path };
+        let watermark = Self { file, path, sampled: Mutex::default() };
         watermark.write(ACKNOWLEDGED_AT, acknowledged)?;
         watermark.write(SAMPLED_AT, sampled)?;
         watermark.file.sync_all().map_err(StoreError::io("write", &watermark.path))?;
@@ -40,9 +43,18 @@ impl Watermark {
 
     /// Of an existing store.
     pub(crate) fn open(dir: &Path) -> Result<Self, StoreError> {
+        Self::open_with(dir, OpenOptions::new().read(true).write(true))
+    }
+
+    /// Of an existing store, which may be on a disk that cannot be written.
+    pub(crate) fn open_to_read(dir: &Path) -> Result<Self, StoreError> {
+        Self::open_with(dir, OpenOptions::new().read(true))
+    }
+
+    fn open_with(dir: &Path, options: &OpenOptions) -> Result<Self, StoreError> {
         let path = dir.join(FILE);
-        match OpenOptions::new().read(true).write(true).open(&path) {
-            Ok(file) => Ok(Self { file, path }),
+        match options.open(&path) {
+            Ok(file) => Ok(Self { file, path, sampled: Mutex::default() }),
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
                 Err(StoreError::damaged(dir, format!("its file `{FILE}` is missing")))
             }
@@ -65,9 +77,15 @@ impl Watermark {
         self.write(ACKNOWLEDGED_AT, segments)
     }
 
-    /// To be called with the new total before sampled transitions are handed out.
-    pub(crate) fn set_sampled(&self, transitions: u64) -> Result<(), StoreError> {
-        self.write(SAMPLED_AT, transitions)
+    /// To be called with the new total before sampled transitions are handed out. Of several that come at once the greatest
+    /// stays.
+    pub(crate) fn raise_sampled(&self, transitions: u64) -> Result<(), StoreError> {
+        let mut noted = self.sampled.lock().unwrap_or_else(PoisonError::into_inner);
+        if *noted < transitions {
+            self.write(SAMPLED_AT, transitions)?;
+            *noted = transitions;
+        }
+        Ok(())
     }
 
     fn write(&self, at: u64, number: u64) -> Result<(), StoreError> {

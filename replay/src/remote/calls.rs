@@ -1,5 +1,6 @@
 //! Short calls to a replay service, and how it is connected.
 
+use std::future::Future;
 use std::time::Duration;
 
 use getup_proto::v1::replay_client::ReplayClient;
@@ -40,16 +41,17 @@ pub async fn update_priorities(
     priorities: &[(u64, f32)],
 ) -> Result<u64, Status> {
     let (keys, priorities) = priorities.iter().copied().unzip();
-    let reply = client(&endpoint.into())?
-        .update_priorities(v1::UpdatePrioritiesRequest { keys, priorities, table: table.to_owned() })
-        .await?;
-    Ok(reply.into_inner().updated)
+    let mut client = client(&endpoint.into())?;
+    let request = v1::UpdatePrioritiesRequest { keys, priorities, table: table.to_owned() };
+    Ok(in_time(client.update_priorities(request)).await?.updated)
 }
 
 /// Has the service copy the store of a table (empty for the default) to `snapshots/NAME` in its folder.
 ///
+/// It returns when the copy is on the disk, however long that takes.
+///
 /// # Errors
-/// As [`describe`]; INVALID_ARGUMENT if the name is none, FAILED_PRECONDITION if the copy cannot be made.
+/// UNAVAILABLE if the service is not there, INVALID_ARGUMENT if the name is none, FAILED_PRECONDITION if the copy cannot be made.
 pub async fn take_snapshot(
     endpoint: impl Into<Endpoint>,
     table: &str,
@@ -61,7 +63,14 @@ pub async fn take_snapshot(
 
 pub(super) async fn ask(mut client: ReplayClient<Channel>, table: &str) -> Result<v1::DescribeReply, Status> {
     let request = v1::DescribeRequest { table: table.to_owned() };
-    let answer = tokio::time::timeout(CALL_PATIENCE, client.describe(request)).await;
+    in_time(client.describe(request)).await
+}
+
+/// What a short call answers.
+pub(super) async fn in_time<T>(
+    call: impl Future<Output = Result<tonic::Response<T>, Status>>,
+) -> Result<T, Status> {
+    let answer = tokio::time::timeout(CALL_PATIENCE, call).await;
     answer.map_err(|_| Status::deadline_exceeded("replay does not answer"))?.map(tonic::Response::into_inner)
 }
 

@@ -5,14 +5,15 @@ use std::sync::mpsc::SyncSender;
 use getup_proto::v1::replay_client::ReplayClient;
 use getup_proto::{MAX_MESSAGE_BYTES, v1};
 use getup_telemetry::Backoff;
-use getup_transport::Endpoint;
+use getup_transport::{Channel, Endpoint};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Code, Status};
+use tonic::Status;
 
 use super::bell::Bell;
-use super::calls::{CALL_PATIENCE, ask, channel};
-use super::{REASON_TICK, Reason, RemoteOptions, lock};
+use super::calls::{ask, channel, in_time};
+use super::{Reason, RemoteOptions, lock};
+use crate::gate::REASON_TICK;
 use crate::minibatch::{Minibatch, SampleOptions};
 use crate::source::SampleError;
 
@@ -120,7 +121,7 @@ impl Fetching {
         }
         let mut inbound = match client.sample(ReceiverStream::new(outbound)).await {
             Ok(response) => response.into_inner(),
-            Err(status) => return self.end(status),
+            Err(status) => return self.end(&status),
         };
         self.admitted = true;
         // Taken since credits were last given.
@@ -132,17 +133,12 @@ impl Fetching {
                     Ok(Some(reply)) => {
                         backoff.reset();
                         asked_why.reset();
-                        // What was waited for has come.
-                        if std::mem::take(&mut self.explained) {
-                            self.explain(self.awaited());
-                            self.explained = false;
-                        }
-                        if let Err(end) = self.enqueue(reply) {
+                        if let Err(end) = self.received(reply) {
                             return end;
                         }
                     }
                     Ok(None) => return End::Gone("it ended the stream".to_owned()),
-                    Err(status) => return self.end(status),
+                    Err(status) => return self.end(&status),
                 },
                 taken = self.consumed.recv() => {
                     if taken.is_none() {
@@ -158,44 +154,49 @@ impl Fetching {
                         }
                     }
                 },
-                Some(priorities) = self.updates.recv() => {
-                    let (keys, priorities) = priorities.into_iter().unzip();
-                    let table = self.options.table.clone();
-                    let request = v1::UpdatePrioritiesRequest { keys, priorities, table };
-                    let mut client = client.clone();
-                    // Beside the stream, which must not wait for it. One that fails is found anew at the next draw.
-                    tokio::spawn(async move {
-                        let sent = tokio::time::timeout(CALL_PATIENCE, client.update_priorities(request)).await;
-                        match sent {
-                            Ok(Ok(_)) => {}
-                            Ok(Err(status)) => tracing::debug!("priorities were lost: {}", status.message()),
-                            Err(_) => tracing::debug!("priorities were lost: replay does not answer"),
-                        }
-                    });
-                },
+                Some(priorities) = self.updates.recv() => self.send_priorities(client.clone(), priorities),
                 _ = asked_why.tick(), if self.queued == 0 => {
-                    if let Ok(described) = ask(ReplayClient::new(channel.clone()), &self.options.table).await {
-                        let waiting = described.limiter.map(|limiter| limiter.waiting).unwrap_or_default();
-                        self.explain(if waiting.is_empty() { self.awaited() } else { waiting });
-                    }
+                    self.ask_why(ReplayClient::new(channel.clone())).await;
                 },
             }
         }
     }
 
-    fn end(&self, status: Status) -> End {
-        let reason = getup_transport::reason(&status);
-        match status.code() {
-            // A token that is not known where another was reaches the two of them at different times.
-            Code::Unauthenticated if self.admitted => End::Gone(reason),
-            Code::InvalidArgument
-            | Code::FailedPrecondition
-            | Code::NotFound
-            | Code::Unimplemented
-            | Code::Unauthenticated
-            | Code::PermissionDenied
-            | Code::OutOfRange => End::Refused(reason),
-            _ => End::Gone(reason),
+    fn received(&mut self, reply: v1::SampleReply) -> Result<(), End> {
+        // What was waited for has come.
+        if std::mem::take(&mut self.explained) {
+            self.explain(self.awaited());
+            self.explained = false;
+        }
+        self.enqueue(reply)
+    }
+
+    /// Beside the stream, which must not wait for it. One that fails is found anew at the next draw.
+    fn send_priorities(&self, mut client: ReplayClient<Channel>, priorities: Vec<(u64, f32)>) {
+        let (keys, priorities) = priorities.into_iter().unzip();
+        let table = self.options.table.clone();
+        let request = v1::UpdatePrioritiesRequest { keys, priorities, table };
+        tokio::spawn(async move {
+            if let Err(status) = in_time(client.update_priorities(request)).await {
+                tracing::debug!("priorities were lost: {}", status.message());
+            }
+        });
+    }
+
+    /// Asks what the service waits for.
+    async fn ask_why(&mut self, client: ReplayClient<Channel>) {
+        if let Ok(described) = ask(client, &self.options.table).await {
+            let waiting = described.limiter.map(|limiter| limiter.waiting).unwrap_or_default();
+            self.explain(if waiting.is_empty() { self.awaited() } else { waiting });
+        }
+    }
+
+    fn end(&self, status: &Status) -> End {
+        let reason = getup_transport::reason(status);
+        if getup_transport::is_final(status, self.admitted) {
+            End::Refused(reason)
+        } else {
+            End::Gone(reason)
         }
     }
 

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use getup_proto::RunSpec;
-use getup_telemetry::{Shutdown, Waits};
+use getup_telemetry::{Shutdown, Waiting, Waits};
 use getup_transport::Endpoint;
 use tokio::runtime::Handle;
 use tokio::sync::mpsc;
@@ -18,14 +18,10 @@ pub(crate) use bell::Bell;
 pub use calls::{describe, describe_table, take_snapshot, update_priorities};
 use fetching::Fetching;
 
-use crate::gate::Waiting;
+use crate::gate::CANCEL_TICK;
 use crate::minibatch::{Minibatch, OptionsError, SampleOptions};
 use crate::source::{MinibatchSource, SampleError};
 
-/// How often a wait looks whether it was cancelled.
-const CANCEL_TICK: Duration = Duration::from_millis(50);
-/// How often a wait's reason is brought up to date.
-pub(crate) const REASON_TICK: Duration = Duration::from_secs(1);
 /// Priorities of a message, at least: until there are so many, the service draws by older ones.
 const PRIORITIES_AT_ONCE: usize = 1024;
 /// Messages of priorities that wait for a connection; beyond, they are dropped.
@@ -44,7 +40,6 @@ pub struct RemoteSource {
     gathered: Vec<(u64, f32)>,
     /// Why there is none.
     reason: Reason,
-    waits: Waits,
     /// Since the last minibatch.
     wait: Waiting,
     shutdown: Shutdown,
@@ -98,7 +93,15 @@ impl RemoteSource {
         let fetching =
             Fetching::new(endpoint, options, sender, (consumed, updates), Arc::clone(&reason), bell);
         runtime.spawn(fetching.run());
-        Self { queue, taken, priorities, gathered: Vec::new(), reason, waits, wait: None, shutdown }
+        Self {
+            queue,
+            taken,
+            priorities,
+            gathered: Vec::new(),
+            reason,
+            wait: waits.waiting("learner"),
+            shutdown,
+        }
     }
 
     /// Why there is no minibatch.
@@ -119,7 +122,7 @@ impl MinibatchSource for RemoteSource {
                 Ok(minibatch) => {
                     // The task may just have ended with an error, which is then next in the queue.
                     let _ = self.taken.send(());
-                    self.wait = None;
+                    self.wait.over();
                     return minibatch.map(Some);
                 }
                 // At a shutdown the task may end between the question above and here.
@@ -130,14 +133,7 @@ impl MinibatchSource for RemoteSource {
                 Err(RecvTimeoutError::Timeout) if left.is_zero() => return Ok(None),
                 Err(RecvTimeoutError::Timeout) => {}
             }
-            match &mut self.wait {
-                None => self.wait = Some((self.waits.begin("learner", self.reason()), Instant::now())),
-                Some((guard, explained)) if explained.elapsed() >= REASON_TICK => {
-                    guard.set_reason(lock(&self.reason).clone());
-                    *explained = Instant::now();
-                }
-                Some(_) => {}
-            }
+            self.wait.because_with(|| lock(&self.reason).clone());
         }
     }
 

@@ -22,9 +22,17 @@ pub(super) struct AppendStream {
 }
 
 /// A writer's presence at the store; ends when dropped.
-struct Visit {
+pub(super) struct Visit {
     store: Arc<Store>,
     writer: u64,
+}
+
+impl Visit {
+    /// Introduces the writer; how far its segments are durable.
+    pub(super) fn begin(store: Arc<Store>, writer: u64, name: &str) -> (Self, u64) {
+        let durable = store.introduce(writer, name);
+        (Self { store, writer }, durable)
+    }
 }
 
 impl Drop for Visit {
@@ -35,16 +43,11 @@ impl Drop for Visit {
 
 impl AppendStream {
     /// Introduces the writer.
-    pub(super) async fn new(
-        store: Arc<Store>,
-        jobs: mpsc::Sender<Job>,
-        writer: u64,
-        name: String,
-    ) -> Result<Self, Status> {
-        let (durable, answer) = oneshot::channel();
-        jobs.send(Job::Introduce { writer, name, durable }).await.map_err(|_| failed())?;
-        let durable = answer.await.map_err(|_| failed())?;
-        Ok(Self { visit: Visit { store, writer }, jobs, durable })
+    pub(super) async fn new(jobs: mpsc::Sender<Job>, writer: u64, name: String) -> Result<Self, Status> {
+        let (introduced, answer) = oneshot::channel();
+        jobs.send(Job::Introduce { writer, name, introduced }).await.map_err(|_| failed())?;
+        let (visit, durable) = answer.await.map_err(|_| failed())?;
+        Ok(Self { visit, jobs, durable })
     }
 
     /// Takes segments until the stream ends, breaks, sends something wrong, or `shutdown`; then acknowledges what
@@ -67,6 +70,8 @@ impl AppendStream {
                 tokio::select! {
                     end = &mut reading => break end,
                     () = shutdown.wait() => break Err(shutting_down()),
+                    // What waits for the limiter is not acknowledged: it comes again on another stream.
+                    () = replies.closed() => return,
                     // With `reading`, a sender of it lives.
                     Ok(()) = progress.changed() => {
                         let sequence = *progress.borrow_and_update();

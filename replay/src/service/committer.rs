@@ -2,6 +2,7 @@
 //!
 //! While the disk takes one group, the next gathers in the queue: the busier the service, the larger its commits.
 
+use super::append::Visit;
 use super::blocking::blocking;
 use crate::error::StoreError;
 use crate::gate::Permit;
@@ -18,8 +19,8 @@ const MOST_BYTES: usize = 32 << 20;
 
 /// What a stream asks for.
 pub(super) enum Job {
-    /// Says how far the writer's segments are durable.
-    Introduce { writer: u64, name: String, durable: oneshot::Sender<u64> },
+    /// Says how far the writer's segments are durable, after all that were queued before.
+    Introduce { writer: u64, name: String, introduced: oneshot::Sender<(Visit, u64)> },
     /// Appends a segment, and raises `durable` to its sequence number.
     Append { segment: Segment, permit: Permit, durable: watch::Sender<u64> },
 }
@@ -43,10 +44,10 @@ pub(super) async fn run(
         let mut acknowledgements = Vec::with_capacity(jobs.len());
         for job in jobs.drain(..) {
             match job {
-                Job::Introduce { writer, name, durable } => {
-                    if durable.send(blocking(|| store.introduce(writer, &name)).await).is_err() {
-                        store.farewell(writer);
-                    }
+                Job::Introduce { writer, name, introduced } => {
+                    let visit = blocking(|| Visit::begin(store.clone(), writer, &name)).await;
+                    // Where its stream has gone meanwhile, the visit ends with this.
+                    let _ = introduced.send(visit);
                 }
                 Job::Append { segment, permit, durable } => {
                     acknowledgements.push((segment.sequence, permit, durable));

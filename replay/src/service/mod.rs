@@ -20,8 +20,7 @@ use blocking::blocking;
 use committer::Job;
 use getup_proto::v1::replay_server::{Replay, ReplayServer};
 use getup_proto::{MAX_MESSAGE_BYTES, RunSpec, SpecError, v1};
-use getup_telemetry::health::{ServingStatus, health};
-use getup_telemetry::{Registry, Shutdown};
+use getup_telemetry::{Registry, Shutdown, health};
 use getup_transport::{Credentials, Limits, Listener, Metrics, Server, Window};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -94,27 +93,14 @@ pub async fn serve_at(
         (name, Table { store, jobs })
     };
     let tables: BTreeMap<String, Table> = tables.into().into_stores().into_iter().map(&mut begin).collect();
-    let (reporter, health) = health();
     let service = ReplayServer::new(Service { tables, shutdown: shutdown.clone() })
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES);
-    let drain = {
-        let shutdown = shutdown.clone();
-        async move {
-            shutdown.wait().await;
-            reporter.set_service_status("", ServingStatus::NotServing).await;
-        }
-    };
-    let serving = port.serve(listener, Routes::new(health).add_service(service), drain);
-    let out_of_patience = async {
-        shutdown.wait().await;
-        tokio::time::sleep(GRACE).await;
-    };
+    let routes = Routes::new(health(shutdown.clone())).add_service(service);
     tokio::select! {
-        served = serving => served?,
+        served = port.serve(listener, routes, shutdown) => served?,
         // While its queue has a sender, a committer ends only when its store does, or finds the disk full at the end.
         Some(committed) = committing.join_next() => committed??,
-        () = out_of_patience => tracing::warn!("replay ends with streams open: their clients did not let go"),
     }
     // A committer ends once it has worked off its queue and all streams, which hold the other end, are gone.
     let ended = async {
@@ -182,7 +168,7 @@ impl Replay for Service {
         check_spec(store.spec(), hello.spec, store.metrics())?;
         let name = named(hello.name, || format!("writer {}", hello.writer));
         let (replies, outbound) = mpsc::channel(REPLIES);
-        let stream = AppendStream::new(store.clone(), jobs.clone(), hello.writer, name).await?;
+        let stream = AppendStream::new(jobs.clone(), hello.writer, name).await?;
         tokio::spawn(stream.run(inbound, replies, self.shutdown.clone()));
         Ok(Response::new(ReceiverStream::new(outbound)))
     }
@@ -284,15 +270,11 @@ fn no_hello() -> Status {
 }
 
 fn check_spec(ours: &RunSpec, theirs: Option<v1::RunSpec>, metrics: &ReplayMetrics) -> Result<(), Status> {
-    let parsed = theirs.ok_or(SpecError::Missing).and_then(RunSpec::parse);
-    let status = match parsed.map(|theirs| ours.check_same(&theirs)) {
-        Ok(Ok(())) => return Ok(()),
-        Ok(Err(differs)) => Status::failed_precondition(differs.to_string()),
-        Err(other @ SpecError::Protocol { .. }) => Status::failed_precondition(other.to_string()),
-        Err(malformed) => Status::invalid_argument(malformed.to_string()),
-    };
-    metrics.reject("spec");
-    Err(status)
+    let theirs = theirs.ok_or(SpecError::Missing).and_then(RunSpec::parse);
+    theirs.and_then(|theirs| ours.check_same(&theirs)).map_err(|error| {
+        metrics.reject("spec");
+        error.into()
+    })
 }
 
 fn named(name: String, otherwise: impl FnOnce() -> String) -> String {

@@ -4,6 +4,7 @@ use std::sync::PoisonError;
 use std::time::{Instant, SystemTime};
 
 use getup_proto::{MAX_MESSAGE_BYTES, columns};
+use rand_chacha::ChaCha8Rng;
 
 use super::Store;
 use crate::error::StoreError;
@@ -12,7 +13,6 @@ use crate::minibatch::{
     Item, MAX_N_STEP, Minibatch, MinibatchColumn, OptionsError, SampleOptions, SampledSegment,
 };
 use crate::ring::{Drawn, Ring};
-use crate::sampler::Sampler;
 use crate::undrawn::Followed;
 
 impl Store {
@@ -49,43 +49,39 @@ impl Store {
         Ok(())
     }
 
-    /// A minibatch, if the limiter lets one out now.
+    /// A minibatch, if the limiter lets one out now, of transitions that `rng` and the store's
+    /// [`ItemSelector`](crate::ItemSelector) decide on.
     ///
     /// # Errors
     /// [`StoreError::Io`] if the sample cannot be counted.
     pub fn try_sample(
         &self,
-        sampler: &mut Sampler,
+        rng: &mut ChaCha8Rng,
         options: &SampleOptions,
     ) -> Result<Option<Minibatch>, StoreError> {
         let started = Instant::now();
         let began = self.traces.is_on().then(SystemTime::now);
-        let mut sampled = 0;
-        let count = |total| {
-            sampled = total;
-            self.watermark.set_sampled(total)
-        };
-        let (found, items, followed, state, held) = if self.selects {
+        let (sampled, found, items, followed, state, held) = if self.selects {
             let mut memory = self.memory.write().unwrap_or_else(PoisonError::into_inner);
-            if !self.gate.try_sample(options.batch as u64, count)? {
-                return Ok(None);
-            }
-            let drawn = sampler.draw(&mut memory.ring, options.batch);
+            let Some(sampled) = self.gate.try_sample(options.batch as u64) else { return Ok(None) };
+            let drawn = (0..options.batch).map(|_| memory.ring.draw(rng)).collect::<Vec<_>>();
             self.gate.set_available(memory.ring.available());
             let ring = &memory.ring;
             let item =
                 |drawn: &Drawn| Item { key: ring.key(drawn.slot), probability: drawn.probability as f32 };
             let items = drawn.iter().map(item).collect();
-            (found(ring, &drawn, options), items, self.followed(ring, &drawn), memory.state, ring.len())
+            let followed = self.followed(ring, &drawn);
+            (sampled, found(ring, &drawn, options), items, followed, memory.state, ring.len())
         } else {
-            if !self.gate.try_sample(options.batch as u64, count)? {
-                return Ok(None);
-            }
+            let Some(sampled) = self.gate.try_sample(options.batch as u64) else { return Ok(None) };
             let memory = self.memory();
-            let drawn = sampler.draw_uniformly(&memory.ring, options.batch);
+            let drawn = (0..options.batch).map(|_| memory.ring.draw_uniformly(rng)).collect::<Vec<_>>();
             let found = found(&memory.ring, &drawn, options);
-            (found, Vec::new(), self.followed(&memory.ring, &drawn), memory.state, memory.ring.len())
+            let followed = self.followed(&memory.ring, &drawn);
+            (sampled, found, Vec::new(), followed, memory.state, memory.ring.len())
         };
+        // Before it is handed out; not under a lock that anybody else waits for, since the disk may take long.
+        self.watermark.raise_sampled(sampled)?;
         let counters = self.counters_of(state, sampled, held);
         self.metrics.sampled.inc_by(options.batch as u64);
         self.metrics.sample_seconds.observe(started.elapsed().as_secs_f64());
