@@ -9,7 +9,7 @@ mod fixtures;
 use common::{open, options};
 use fixtures::{get_up_spec, segment};
 use getup_proto::Segment;
-use getup_replay::{ItemSelector, Remover, ReplayConfig, Sampler};
+use getup_replay::{ItemSelector, Remover, ReplayConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tempfile::TempDir;
@@ -35,7 +35,7 @@ fn soak(settings: ReplayConfig, window: usize) {
     let settings = ReplayConfig { capacity, min_size: 1, ..settings };
     let store = open(dir.path(), &get_up_spec(), &settings).unwrap();
     let mut segments: Vec<Segment> = (1..=16).map(|i| segment(&get_up_spec(), 1, i, 64)).collect();
-    let (mut sampler, mut rng) = (Sampler::new(1), ChaCha8Rng::seed_from_u64(1));
+    let (mut draws, mut rng) = (ChaCha8Rng::seed_from_u64(1), ChaCha8Rng::seed_from_u64(1));
     let (mut steady, mut most) = (None, (0, 0));
     while store.counters().transitions < 11 * capacity as u64 {
         store.append(segments.clone()).unwrap();
@@ -43,7 +43,7 @@ fn soak(settings: ReplayConfig, window: usize) {
             segment.sequence += 16;
             segment.episode += 16;
         }
-        let minibatch = store.try_sample(&mut sampler, &options(256)).unwrap().unwrap();
+        let minibatch = store.try_sample(&mut draws, &options(256)).unwrap().unwrap();
         let priorities: Vec<(u64, f32)> =
             minibatch.items.iter().map(|item| (item.key, rng.random())).collect();
         store.update_priorities(&priorities).unwrap();

@@ -6,7 +6,7 @@ use getup_proto::v1::replay_client::ReplayClient;
 use getup_proto::{RunSpec, Segment, v1};
 use getup_replay::{
     RemoteOptions, RemoteSource, ReplayConfig, ReplayMetrics, SampleOptions, ServeError, Store, StoreError,
-    serve,
+    describe, serve,
 };
 use getup_telemetry::{Registry, Shutdown, Waits};
 use std::path::Path;
@@ -37,6 +37,12 @@ pub fn open(dir: &Path, spec: &RunSpec, config: &ReplayConfig) -> Result<Store, 
 }
 
 /// Waits until `condition` holds.
+/// Says what is not checked, past the test harness, which keeps to itself what a test that passes prints.
+pub fn skip(what: impl std::fmt::Display) {
+    use std::io::Write;
+    let _ = writeln!(std::io::stderr(), "skipped: {what}");
+}
+
 pub fn eventually(what: &str, mut condition: impl FnMut() -> bool) {
     let started = Instant::now();
     while !condition() {
@@ -97,6 +103,11 @@ impl Replay {
         };
         let (waits, shutdown) = (self.waits.clone(), self.shutdown.clone());
         RemoteSource::new(&self.endpoint, options, self.runtime.handle(), waits, shutdown)
+    }
+
+    /// What the default table's longest wait waits for; empty where nobody waits.
+    pub fn waiting(&self) -> String {
+        self.runtime.block_on(describe(&self.endpoint)).unwrap().limiter.unwrap().waiting
     }
 
     pub fn client(&self) -> ReplayClient<Channel> {

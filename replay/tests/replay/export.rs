@@ -1,5 +1,6 @@
 //! What is exported reads back as it was written: by NumPy and by Minari, where a Python has them.
 
+use crate::common::skip;
 use crate::fixtures::{self, Ending, Part};
 use getup_proto::{ColumnSpec, Rows, RunSpec, Segment, columns};
 use getup_replay::{DatasetId, export_minari, export_npz};
@@ -128,12 +129,12 @@ fn check(format: &str, path: &Path, facts: &Path) {
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/replay/export_check.py");
     let output = match Command::new(&python).arg(script).arg(format).arg(path).arg(facts).output() {
         Ok(output) => output,
-        Err(error) => return eprintln!("not checked, {python} does not start: {error}"),
+        Err(error) => return skip(format!("{format}: {python} does not start: {error}")),
     };
     let said = String::from_utf8_lossy(&output.stdout);
     match output.status.code() {
         Some(0) => eprintln!("{said}"),
-        Some(SKIPPED) => eprintln!("not checked by {python}: {said}"),
+        Some(SKIPPED) => skip(format!("{format}: {python}: {said}")),
         _ => panic!("{said}{}", String::from_utf8_lossy(&output.stderr)),
     }
 }

@@ -1,9 +1,9 @@
 //! Peers and disks that fail: back-pressure, a clear word, and nothing lost that was acknowledged.
 
-use crate::common::{self, PATIENCE, Replay, Writer, config, eventually, hello, open, options};
+use crate::common::{self, PATIENCE, Replay, Writer, config, eventually, hello, open, options, skip};
 use crate::fixtures::{get_up_spec, segment, spec};
 use getup_proto::v1;
-use getup_replay::{MinibatchSource, ReplayConfig, Survey, describe};
+use getup_replay::{MinibatchSource, ReplayConfig, Survey};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -34,15 +34,10 @@ impl Drop for SmallDisk {
     }
 }
 
-fn waiting(replay: &Replay) -> String {
-    replay.runtime.block_on(describe(&replay.endpoint)).unwrap().limiter.unwrap().waiting
-}
-
 #[test]
 fn a_full_disk_holds_writers_up_and_loses_nothing() {
     let Some(disk) = SmallDisk::new(6 << 20) else {
-        println!("not checked: this process may not mount a file system");
-        return;
+        return skip("a full disk: this process may not mount a file system");
     };
     let ballast = disk.0.path().join("ballast");
     fs::write(&ballast, vec![1; 2 << 20]).unwrap();
@@ -59,7 +54,7 @@ fn a_full_disk_holds_writers_up_and_loses_nothing() {
         writer.acknowledged(200).await.unwrap();
     });
     eventually("the disk is full, and it says so", || {
-        let waiting = waiting(&replay);
+        let waiting = replay.waiting();
         waiting.contains("No space left") && waiting.contains("Make room on its disk")
     });
     let stored = replay.store.counters().transitions;
@@ -83,8 +78,7 @@ fn a_full_disk_holds_writers_up_and_loses_nothing() {
 #[test]
 fn a_full_disk_does_not_hold_up_the_end_and_keeps_what_was_acknowledged() {
     let Some(disk) = SmallDisk::new(2 << 20) else {
-        println!("not checked: this process may not mount a file system");
-        return;
+        return skip("a full disk: this process may not mount a file system");
     };
     let dir = disk.0.path().join("replay");
     let replay = Replay::start_in(&dir, get_up_spec(), &config());
@@ -105,7 +99,7 @@ fn a_full_disk_does_not_hold_up_the_end_and_keeps_what_was_acknowledged() {
         }
         durable
     });
-    eventually("the disk is full", || waiting(&replay).contains("No space left"));
+    eventually("the disk is full", || replay.waiting().contains("No space left"));
     replay.shutdown.trigger();
     let durable = replay.runtime.block_on(durable).unwrap();
     let (_, seconds) = replay.stop();
@@ -249,4 +243,18 @@ fn with_sync_data_any_cut_behind_the_acknowledged_is_harmless_and_without_it_a_c
         assert!((5..8).contains(&repaired.segments), "{repaired:?}");
         open(&copied, &get_up_spec(), &settings).unwrap();
     }
+}
+
+#[test]
+fn a_writer_that_goes_while_the_limiter_holds_it_leaves_nothing_behind() {
+    let paced =
+        ReplayConfig { min_size: 8, samples_per_insert: Some(1.0), error_buffer: Some(16.0), ..config() };
+    let replay = Replay::start(spec(8), &paced);
+    let writer = replay.writer(1);
+    for sequence in 1..=6 {
+        replay.runtime.block_on(writer.send(&segment(&replay.spec, 1, sequence, 8))).unwrap();
+    }
+    eventually("it waits for a sampler", || replay.waiting().contains("writer"));
+    drop(writer);
+    eventually("nobody waits", || replay.waiting().is_empty());
 }

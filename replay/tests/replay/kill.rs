@@ -32,12 +32,30 @@ fn serves_until_it_is_killed() {
     });
 }
 
-fn start(dir: &Path) -> (Child, String) {
+/// The process, until it is dropped.
+struct Service(Child);
+
+impl Service {
+    fn kill(&mut self) {
+        self.0.kill().unwrap();
+        self.0.wait().unwrap();
+    }
+}
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        // One that was killed is.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+fn start(dir: &Path) -> (Service, String) {
     start_with(dir, None)
 }
 
 /// Starts the process, with a library before all others.
-fn start_with(dir: &Path, library: Option<&Path>) -> (Child, String) {
+fn start_with(dir: &Path, library: Option<&Path>) -> (Service, String) {
     let mut command = Command::new(std::env::current_exe().unwrap());
     if let Some(library) = library {
         command.env("LD_PRELOAD", library);
@@ -51,7 +69,7 @@ fn start_with(dir: &Path, library: Option<&Path>) -> (Child, String) {
     let lines = BufReader::new(child.stdout.take().unwrap()).lines();
     let endpoint =
         lines.map_while(Result::ok).find_map(|line| line.strip_prefix("listening on ").map(str::to_owned));
-    (child, endpoint.expect("the process says where it listens"))
+    (Service(child), endpoint.expect("the process says where it listens"))
 }
 
 /// Writes segments from somewhat before the service's mark until the service is gone; returns what was acknowledged.
@@ -102,8 +120,7 @@ fn every_acknowledged_segment_survives_a_kill_under_load_and_none_is_stored_twic
                 sampled = minibatch.counters.sampled;
             }
         }
-        child.kill().unwrap();
-        child.wait().unwrap();
+        child.kill();
         for writing in writing {
             runtime.block_on(writing).unwrap();
         }
@@ -176,18 +193,17 @@ fn a_slow_disk_holds_up_writers_and_not_samplers_and_loses_nothing() {
     let mut source = sampler(&endpoint, &runtime);
     let started = Instant::now();
     let (mut minibatches, mut steps, mut last) = (0, 0, 0);
-    while started.elapsed() < Duration::from_millis(1_500) {
+    while steps < 20 {
+        assert!(started.elapsed() < PATIENCE, "{last} segments acknowledged, {minibatches} minibatches");
         minibatches += u64::from(source.poll(Duration::from_millis(5)).unwrap().is_some());
         let now = acknowledged.load(Ordering::SeqCst);
         steps += u64::from(now > last);
         last = now;
     }
-    // Thirty writes at most: the disk is slow, segments share commits, and samples come all the while.
-    assert!((1..=75).contains(&steps), "{steps} times something was acknowledged");
-    assert!(last > 60, "{last} segments were acknowledged");
-    assert!(minibatches > 200, "{minibatches} minibatches meanwhile");
-    child.kill().unwrap();
-    child.wait().unwrap();
+    // Twenty writes of a twentieth of a second: the disk is slow, segments share commits, and samples come all the while.
+    assert!(last > 2 * steps, "{last} segments were acknowledged in {steps} steps");
+    assert!(minibatches > 5 * steps, "{minibatches} minibatches in {steps} steps");
+    child.kill();
     runtime.block_on(writing).unwrap();
     let store = open(&store, &spec(STEPS), &config()).unwrap();
     assert!(store.introduce(1, "actor") >= acknowledged.load(Ordering::SeqCst));
@@ -200,31 +216,45 @@ const TOLD_SYNCS: &str = r#"
 #include <stdio.h>
 #include <unistd.h>
 
-int fsync(int file) {
-    static int (*real)(int);
-    if (!real) real = (int (*)(int))dlsym(RTLD_NEXT, "fsync");
+static void tell(int file) {
     char link[64], path[4096];
     snprintf(link, sizeof link, "/proc/self/fd/%d", file);
     ssize_t length = readlink(link, path, sizeof path);
     if (length > 0) dprintf(2, "synced %.*s\n", (int)length, path);
+}
+
+int fsync(int file) {
+    static int (*real)(int);
+    if (!real) real = (int (*)(int))dlsym(RTLD_NEXT, "fsync");
+    tell(file);
+    return real(file);
+}
+
+int fdatasync(int file) {
+    static int (*real)(int);
+    if (!real) real = (int (*)(int))dlsym(RTLD_NEXT, "fdatasync");
+    tell(file);
     return real(file);
 }
 "#;
 const OPENED: &str = "the store is open\n";
+const ACKNOWLEDGED: &str = "the segment is acknowledged\n";
 
 /// The process whose syncs are told: without its variable there is nothing to prove here.
 #[test]
-fn opens_and_copies_a_store_that_syncs() {
+fn opens_appends_to_and_copies_a_store_that_syncs() {
     let Some(dir) = std::env::var_os(DIR) else { return };
     let dir = Path::new(&dir);
     let synced = ReplayConfig { sync: SyncMode::Data, ..config() };
     let store = open(dir, &spec(STEPS), &synced).unwrap();
     eprint!("{OPENED}");
+    store.append(vec![segment(&spec(STEPS), 1, 2, STEPS)]).unwrap();
+    eprint!("{ACKNOWLEDGED}");
     store.snapshot(&dir.join("snapshots/copy")).unwrap();
 }
 
 #[test]
-fn with_sync_data_what_is_read_back_reaches_the_disk_before_it_counts_and_so_does_a_snapshot() {
+fn with_sync_data_all_reaches_the_disk_before_it_counts_what_is_read_back_acknowledged_and_copied() {
     let folder = TempDir::new().unwrap();
     let library = library(folder.path(), TOLD_SYNCS);
     let dir = folder.path().canonicalize().unwrap().join("store");
@@ -233,19 +263,21 @@ fn with_sync_data_what_is_read_back_reaches_the_disk_before_it_counts_and_so_doe
     store.append(vec![segment(&spec(STEPS), 1, 1, STEPS)]).unwrap();
     drop(store);
     let output = Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "kill::opens_and_copies_a_store_that_syncs", "--nocapture"])
+        .args(["--exact", "kill::opens_appends_to_and_copies_a_store_that_syncs", "--nocapture"])
         .env(DIR, &dir)
         .env("LD_PRELOAD", &library)
         .output()
         .unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{said}");
-    let (opening, copying) = said.split_once(OPENED).unwrap();
+    let (opening, rest) = said.split_once(OPENED).unwrap();
+    let (appending, copying) = rest.split_once(ACKNOWLEDGED).unwrap();
     let newest = "segments/00000000000000000000.seg";
     let copied = "snapshots/.copy.unfinished";
     for (said, name) in [
         (opening, newest.to_owned()),
         (opening, "segments".to_owned()),
+        (appending, newest.to_owned()),
         (copying, format!("{copied}/{newest}")),
         (copying, format!("{copied}/segments")),
         (copying, format!("{copied}/watermark")),

@@ -3,8 +3,10 @@
 use crate::common::{Replay, config, eventually, open, options};
 use crate::fixtures::{Ending, Part, segment, spec};
 use getup_proto::Segment;
-use getup_replay::{ReplayConfig, Sampler, Survey, compact, repair, segments, take_snapshot};
+use getup_replay::{ReplayConfig, Survey, compact, repair, segments, take_snapshot};
 use proptest::prelude::*;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -171,11 +173,11 @@ fn compacting_keeps_the_newest_the_totals_and_the_marks() {
     let settings = ReplayConfig { capacity: 10_000, ..config() };
     let store = open(dir.path(), &spec(STEPS), &settings).unwrap();
     store.append(vec![segment(&spec(STEPS), 77, 5, STEPS)]).unwrap();
-    let mut sampler = Sampler::new(1);
+    let mut draws = ChaCha8Rng::seed_from_u64(1);
     for sequence in 1..=200 {
         store.append(vec![segment(&spec(STEPS), 1, sequence, STEPS)]).unwrap();
     }
-    store.try_sample(&mut sampler, &options(32)).unwrap().unwrap();
+    store.try_sample(&mut draws, &options(32)).unwrap().unwrap();
     let counters = store.counters();
     drop(store);
     let all = read(dir.path());
@@ -194,10 +196,10 @@ fn compacting_keeps_the_newest_the_totals_and_the_marks() {
     assert_eq!((store.counters().transitions, store.len()), (counters.transitions, 0));
     assert_eq!((store.introduce(77, "actor"), store.introduce(1, "actor")), (5, 200));
     // Nothing to sample, whatever the totals say.
-    assert!(store.try_sample(&mut sampler, &options(32)).unwrap().is_none());
+    assert!(store.try_sample(&mut draws, &options(32)).unwrap().is_none());
     store.append(vec![segment(&spec(STEPS), 1, 201, STEPS)]).unwrap();
     assert_eq!(store.len(), STEPS);
-    store.try_sample(&mut sampler, &options(32)).unwrap().unwrap();
+    store.try_sample(&mut draws, &options(32)).unwrap().unwrap();
 }
 
 #[test]

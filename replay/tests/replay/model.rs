@@ -3,9 +3,11 @@
 use crate::common::{config, open};
 use crate::fixtures::{Ending, Part, spec};
 use getup_proto::Segment;
-use getup_replay::{ItemSelector, Remover, ReplayConfig, SampleOptions, Sampler, Store, compact, segments};
+use getup_replay::{ItemSelector, Remover, ReplayConfig, SampleOptions, Store, compact, segments};
 use proptest::prelude::*;
 use proptest::sample::Index;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 use std::collections::HashMap;
 use std::path::Path;
 use tempfile::TempDir;
@@ -243,7 +245,7 @@ proptest! {
         let dir = TempDir::new().unwrap();
         let mut commit = COMMIT;
         let mut store = open(dir.path(), &spec(STEPS), &settings).unwrap();
-        let (mut model, mut writers, mut sampler) = (Model::new(&settings), Writers::default(), Sampler::new(1));
+        let (mut model, mut writers, mut draws) = (Model::new(&settings), Writers::default(), ChaCha8Rng::seed_from_u64(1));
         for action in actions {
             match action {
                 Action::Append(parts) => {
@@ -254,7 +256,7 @@ proptest! {
                 }
                 Action::Sample(batch, n_step) => {
                     let options = SampleOptions { batch, n_step, gamma: 0.9, seed: 0, segments: false };
-                    let Some(minibatch) = store.try_sample(&mut sampler, &options).unwrap() else {
+                    let Some(minibatch) = store.try_sample(&mut draws, &options).unwrap() else {
                         prop_assert_eq!(model.env_steps, 0, "sampling waits for the first env step alone");
                         continue;
                     };

@@ -3,8 +3,7 @@
 use crate::common::{config, open, options};
 use crate::fixtures::{Ending, Part, get_up_spec, segment, spec, value};
 use getup_replay::{
-    Item, ItemSelector, Minibatch, Remover, ReplayConfig, Sampler, Store, StoreError, Survey, compact,
-    segments,
+    Item, ItemSelector, Minibatch, Remover, ReplayConfig, Store, StoreError, Survey, compact, segments,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -45,7 +44,7 @@ fn every_transition_is_drawn_as_it_was_appended_also_after_thousands_have_left_b
     let spec = spec(STEPS);
     let store = open(dir.path(), &spec, &lowest_priority(1000, 4)).unwrap();
     let mut rng = ChaCha8Rng::seed_from_u64(4);
-    let mut sampler = Sampler::new(2);
+    let mut draws = ChaCha8Rng::seed_from_u64(2);
     // Of each key, the segment and the step.
     let mut origins: HashMap<u64, (u64, usize)> = HashMap::new();
     let mut oldest_drawn = 0;
@@ -64,7 +63,7 @@ fn every_transition_is_drawn_as_it_was_appended_also_after_thousands_have_left_b
         store.append(appended).unwrap();
         assert!(store.len() <= 1000);
         assert_eq!(store.update_priorities(&priorities).unwrap(), priorities.len() as u64);
-        let minibatch = store.try_sample(&mut sampler, &options(64)).unwrap().unwrap();
+        let minibatch = store.try_sample(&mut draws, &options(64)).unwrap().unwrap();
         let column = |name: &str| minibatch.column(name).unwrap();
         for (i, item) in minibatch.items.iter().enumerate() {
             let (sequence, step) = origins[&item.key];
@@ -103,11 +102,10 @@ fn draws_follow_the_priorities_of_what_is_left() {
 
     let total: f32 = priorities.values().sum();
     let mut counts: HashMap<u64, f32> = HashMap::new();
-    let mut sampler = Sampler::new(6);
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
     let draws = 400 * 64;
     for _ in 0..400 {
-        for Item { key, probability } in store.try_sample(&mut sampler, &options(64)).unwrap().unwrap().items
-        {
+        for Item { key, probability } in store.try_sample(&mut rng, &options(64)).unwrap().unwrap().items {
             assert!((probability - priorities[&key] / total).abs() < 1e-6, "transition {key}");
             *counts.entry(key).or_default() += 1.0;
         }
@@ -145,7 +143,7 @@ fn what_was_removed_stays_in_the_log_for_its_window_and_a_restart_begins_with_th
     // Priorities are forgotten: the newest are there, under the same keys.
     let store = open(dir.path(), &spec(STEPS), &settings).unwrap();
     assert_eq!(there(&store, 120, |_| 1.0), keys(6..=15));
-    let minibatch = store.try_sample(&mut Sampler::new(1), &options(50)).unwrap().unwrap();
+    let minibatch = store.try_sample(&mut ChaCha8Rng::seed_from_u64(1), &options(50)).unwrap().unwrap();
     for (item, &observed) in
         minibatch.items.iter().zip(minibatch.column("observation").unwrap().data.iter().step_by(3))
     {
@@ -223,7 +221,8 @@ fn an_episode_whose_middle_was_removed_bootstraps_before_the_gap_and_never_acros
     store.update_priorities(&keys([2]).into_iter().map(|key| (key, 0.1)).collect::<Vec<_>>()).unwrap();
     store.append(vec![segment(&spec(STEPS), 2, 1, STEPS)]).unwrap();
     let options = getup_replay::SampleOptions { n_step: 5, ..options(200) };
-    let minibatch: Minibatch = store.try_sample(&mut Sampler::new(3), &options).unwrap().unwrap();
+    let minibatch: Minibatch =
+        store.try_sample(&mut ChaCha8Rng::seed_from_u64(3), &options).unwrap().unwrap();
     let (next, discount) =
         (minibatch.column("next_observation").unwrap(), minibatch.column("discount").unwrap());
     let mut seen = [0; 24];
@@ -248,12 +247,12 @@ fn the_disk_is_bounded_by_the_window() {
     let (capacity, window) = (4096, 3);
     let store = open(dir.path(), &get_up_spec(), &lowest_priority(capacity, window)).unwrap();
     let (mut most, mut steady) = (0, 0);
-    let mut sampler = Sampler::new(1);
+    let mut draws = ChaCha8Rng::seed_from_u64(1);
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     // Ten windows.
     for round in 0..120 {
         store.append((1..=16).map(|i| segment(&get_up_spec(), 1, round * 16 + i, 64)).collect()).unwrap();
-        let items = store.try_sample(&mut sampler, &options(256)).unwrap().unwrap().items;
+        let items = store.try_sample(&mut draws, &options(256)).unwrap().unwrap().items;
         store
             .update_priorities(&items.iter().map(|item| (item.key, rng.random())).collect::<Vec<_>>())
             .unwrap();

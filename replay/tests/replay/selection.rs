@@ -7,9 +7,11 @@ use getup_proto::v1::replay_client::ReplayClient;
 use getup_proto::{RunSpec, v1};
 use getup_replay::{
     ItemSelector, Minibatch, MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, ReplayMetrics,
-    Sampler, Store, TableError, Tables, describe, describe_table, serve, update_priorities,
+    Store, TableError, Tables, describe_table, serve, update_priorities,
 };
 use getup_telemetry::{Registry, Shutdown, Waits};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 use std::sync::Arc;
 use std::time::Duration;
 use tempfile::TempDir;
@@ -53,7 +55,7 @@ fn a_queue_hands_out_each_transition_once_in_order_and_waits_on_both_sides() {
         }
         writer.acknowledged(50).await.unwrap();
     });
-    eventually("the writer waits", || waiting(&replay).starts_with("writer waits"));
+    eventually("the writer waits", || replay.waiting().starts_with("writer waits"));
     eventually("what came before is durable", || replay.store.counters().env_steps == 64);
     let mut source = replay.source(options(16), 2);
     let mut taken = Vec::new();
@@ -65,11 +67,7 @@ fn a_queue_hands_out_each_transition_once_in_order_and_waits_on_both_sides() {
     replay.runtime.block_on(async { tokio::time::timeout(PATIENCE, sending).await }).unwrap().unwrap();
     // Everything was taken.
     assert!(source.poll(Duration::from_millis(100)).unwrap().is_none());
-    eventually("the sampler waits", || waiting(&replay).contains("0 of 16 transitions can be sampled"));
-}
-
-fn waiting(replay: &Replay) -> String {
-    replay.runtime.block_on(describe(&replay.endpoint)).unwrap().limiter.unwrap().waiting
+    eventually("the sampler waits", || replay.waiting().contains("0 of 16 transitions can be sampled"));
 }
 
 #[test]
@@ -90,7 +88,7 @@ fn a_batch_that_a_full_store_might_never_have_the_draws_for_is_refused() {
     // After the longest segment they may be 37: see the ring.
     assert!(store.check_options(&options(2 * 37 + 1)).is_err());
     store.check_options(&options(2 * 37)).unwrap();
-    assert!(store.try_sample(&mut Sampler::new(1), &options(2 * 37)).unwrap().is_some());
+    assert!(store.try_sample(&mut ChaCha8Rng::seed_from_u64(1), &options(2 * 37)).unwrap().is_some());
     drop(store);
     // Without a limit any batch comes.
     open(dir.path(), &spec(STEPS), &times(None)).unwrap().check_options(&options(1_000)).unwrap();
@@ -102,11 +100,11 @@ fn lifo_hands_out_the_newest() {
     let newest =
         ReplayConfig { sampler: ItemSelector::Lifo, max_times_sampled: Some(1), capacity: 100, ..config() };
     let store = open(dir.path(), &spec(STEPS), &newest).unwrap();
-    let mut sampler = Sampler::new(1);
+    let mut draws = ChaCha8Rng::seed_from_u64(1);
     filled(&store, 1..=40);
-    let mut taken = origins(&store.try_sample(&mut sampler, &options(10)).unwrap().unwrap());
+    let mut taken = origins(&store.try_sample(&mut draws, &options(10)).unwrap().unwrap());
     filled(&store, 41..=41);
-    taken.extend(origins(&store.try_sample(&mut sampler, &options(8)).unwrap().unwrap()));
+    taken.extend(origins(&store.try_sample(&mut draws, &options(8)).unwrap().unwrap()));
     let down = |sequence| (0..STEPS).rev().map(move |step| (sequence, step));
     let expected: Vec<_> = down(40).chain(down(39)).take(10).chain(down(41)).collect();
     assert_eq!(taken, expected);
@@ -150,10 +148,10 @@ fn priorities_move_the_draws_and_weights_make_up_for_them() {
     let refused = update(&[(0, 0.5), (1, f32::NAN)]).unwrap_err();
     assert!(refused.message().contains("priority of transition 1 is NaN"), "{refused}");
 
-    let mut sampler = Sampler::new(3);
+    let mut draws = ChaCha8Rng::seed_from_u64(3);
     let mut counts = [0.0_f64; 80];
     for _ in 0..400 {
-        let minibatch = replay.store.try_sample(&mut sampler, &options(64)).unwrap().unwrap();
+        let minibatch = replay.store.try_sample(&mut draws, &options(64)).unwrap().unwrap();
         let weights = minibatch.importance_weights(1.0);
         for (item, weight) in minibatch.items.iter().zip(weights) {
             counts[item.key as usize] += 1.0;
@@ -183,7 +181,7 @@ fn keys_are_the_same_after_a_restart_and_after_evictions() {
     filled(&store, 1..=60);
     drop(store);
     let store = open(dir.path(), &spec(STEPS), &settings).unwrap();
-    let minibatch = store.try_sample(&mut Sampler::new(1), &options(50)).unwrap().unwrap();
+    let minibatch = store.try_sample(&mut ChaCha8Rng::seed_from_u64(1), &options(50)).unwrap().unwrap();
     for (item, (sequence, step)) in minibatch.items.iter().zip(origins(&minibatch)) {
         assert_eq!(item.key, (sequence - 1) * STEPS as u64 + step as u64);
     }

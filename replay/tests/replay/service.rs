@@ -197,9 +197,9 @@ fn writers_wait_for_samplers_and_say_so_and_go_on_when_these_have_sampled() {
         writer.acknowledged(40).await.unwrap();
     });
     // Up to the band's upper edge: (16 - 8) x 4 = 32 samples ahead.
-    eventually("the writer waits", || describe_waiting(&replay).starts_with("writer waits"));
+    eventually("the writer waits", || replay.waiting().starts_with("writer waits"));
     eventually("what came before is durable", || replay.store.counters().env_steps == 16);
-    let waiting = describe_waiting(&replay);
+    let waiting = replay.waiting();
     assert!(waiting.contains("16 env steps with 0 samples are ahead of 4 samples per insert"), "{waiting}");
     assert!(waiting.contains("no sampler has come"), "{waiting}");
 
@@ -215,10 +215,6 @@ fn writers_wait_for_samplers_and_say_so_and_go_on_when_these_have_sampled() {
     replay.runtime.block_on(sending).unwrap();
     assert_eq!(replay.store.counters().env_steps, 160);
     assert!(replay.store.counters().sampled >= 160 * 4 - 64);
-}
-
-fn describe_waiting(replay: &Replay) -> String {
-    replay.runtime.block_on(describe(&replay.endpoint)).unwrap().limiter.unwrap().waiting
 }
 
 #[test]
