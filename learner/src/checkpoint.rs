@@ -232,12 +232,14 @@ impl Checkpoint {
         format!("step-{:012}-{:012}.safetensors", self.progress.env_steps, self.scalars.updates)
     }
 
-    /// Writes the checkpoint into `folder` and removes all but the newest `kept`.
+    /// Writes the checkpoint into `folder` and removes all but `kept`: it, and the newest others.
     pub fn save(&self, folder: &Path, kept: usize) -> Result<PathBuf, CheckpointError> {
         remove_unfinished(folder)?;
         let path = folder.join(self.file_name());
         write_atomically(&path, &self.to_bytes())?;
-        for old in list(folder)?.into_iter().rev().skip(kept) {
+        // Not this one, whatever else is there: files from before a resumption may have later names.
+        let others = list(folder)?.into_iter().filter(|other| *other != path);
+        for old in others.rev().skip(kept.max(1) - 1) {
             fs::remove_file(&old).map_err(|source| CheckpointError::Io { path: old, source })?;
         }
         Ok(path)
@@ -342,7 +344,12 @@ fn read_buffer(file: &SafeTensors<'_>, name: &str) -> Result<Vec<f32>, String> {
         return Err(format!("tensor {name:?} is {:?}, not F32", tensor.dtype()));
     }
     let bytes = tensor.data().chunks_exact(4);
-    Ok(bytes.map(|bytes| f32::from_le_bytes(bytes.try_into().expect("chunks of four"))).collect())
+    let values = bytes.map(|bytes| f32::from_le_bytes(bytes.try_into().expect("chunks of four")));
+    let values: Vec<f32> = values.collect();
+    match values.iter().find(|value| !value.is_finite()) {
+        Some(value) => Err(format!("tensor {name:?} holds {value}")),
+        None => Ok(values),
+    }
 }
 
 /// Checkpoint files, oldest first.
@@ -454,6 +461,17 @@ mod tests {
         let bytes = fs::read(&newest).unwrap();
         fs::write(&newest, &bytes[..bytes.len() / 2]).unwrap();
         assert_eq!(Checkpoint::newest(folder.path()).unwrap().unwrap().progress.env_steps, 20);
+        let mut spoiled = Checkpoint::newest(folder.path()).unwrap().unwrap();
+        spoiled.progress.env_steps = 21;
+        spoiled.tensors.get_mut("actor").unwrap()[3] = f32::NAN;
+        let path = spoiled.save(folder.path(), 3).unwrap();
+        assert!(Checkpoint::load(&path).unwrap_err().to_string().contains("\"actor\" holds NaN"));
+        assert_eq!(Checkpoint::newest(folder.path()).unwrap().unwrap().progress.env_steps, 20);
+        // Later names that cannot be read do not push out what is written now.
+        spoiled.tensors.get_mut("actor").unwrap()[3] = 0.0;
+        spoiled.progress.env_steps = 15;
+        let path = spoiled.save(folder.path(), 1).unwrap();
+        assert_eq!(list(folder.path()).unwrap(), [path]);
         let wider = SacConfig { hidden: vec![5], ..SacConfig::default() };
         let mut other = Sac::new(&shape, &wider, 0, Device::Cpu, 1);
         let error = Checkpoint::newest(folder.path()).unwrap().unwrap().restore(&mut other).unwrap_err();

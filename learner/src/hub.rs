@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
+use getup_proto::names::FALLS_SCENARIO;
 use getup_proto::{RunSpec, SpecError, v1};
 use getup_telemetry::Waits;
 use tokio::sync::watch;
@@ -223,7 +224,7 @@ impl Hub {
         Some(v1::EvaluationLease {
             id: self.lease_base + id,
             policy: Some(v1::PolicyUpdate::clone(&evaluation.policy)),
-            scenario: "falls".into(),
+            scenario: FALLS_SCENARIO.into(),
             seeds: self.seeds.clone(),
             keep_alive_seconds: self.keep_alive.as_secs_f64(),
         })

@@ -1,6 +1,6 @@
 //! What `/metrics` says of a learner's actors and leases: [`HubMetrics`], asked whenever it is read.
 
-use std::sync::Weak;
+use std::sync::{Mutex, PoisonError, Weak};
 use std::time::Instant;
 
 use getup_telemetry::prometheus::core::{Collector, Desc};
@@ -19,6 +19,8 @@ pub struct HubMetrics {
     leases: IntGaugeVec,
     expirations: IntCounter,
     superseded: IntCounter,
+    /// Held by whoever reads them.
+    collecting: Mutex<()>,
 }
 
 impl HubMetrics {
@@ -51,6 +53,7 @@ impl HubMetrics {
             leases: IntGaugeVec::new(leases, &["state"]).expect(WELL_FORMED),
             expirations: IntCounter::with_opts(expirations).expect(WELL_FORMED),
             superseded: IntCounter::with_opts(superseded).expect(WELL_FORMED),
+            collecting: Mutex::default(),
         }
     }
 
@@ -74,6 +77,8 @@ impl Collector for HubMetrics {
 
     fn collect(&self) -> Vec<MetricFamily> {
         let Some(hub) = self.hub.upgrade() else { return Vec::new() };
+        // Two who read at once would see each other's half, and count what is counted twice.
+        let _alone = self.collecting.lock().unwrap_or_else(PoisonError::into_inner);
         let actors = hub.actors(Instant::now());
         self.actors.set(actors.iter().filter(|actor| actor.silent < ACTOR_LOST).count() as i64);
         self.silent.reset();

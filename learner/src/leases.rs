@@ -84,9 +84,21 @@ impl<T, R> Leases<T, R> {
         self.table.push_back((evaluation, State::Offered));
     }
 
-    /// The oldest evaluation nobody holds, now leased to `holder`, with the lease's number.
+    /// The oldest evaluation nobody holds, now leased to `holder`, with the lease's number. One who holds a lease already did
+    /// not hear of it: it is told again.
     pub fn acquire(&mut self, holder: &str, now: Instant) -> Option<(u64, &T)> {
         self.expire(now);
+        let until = now + self.keep_alive;
+        let held = self.table.iter_mut().enumerate().find_map(|(index, (_, state))| match state {
+            State::Leased { id, holder: held_by, expires } if held_by == holder => {
+                *expires = until;
+                Some((*id, index))
+            }
+            _ => None,
+        });
+        if let Some((id, index)) = held {
+            return Some((id, &self.table[index].0));
+        }
         let (evaluation, state) = self.table.iter_mut().find(|(_, state)| matches!(state, State::Offered))?;
         let id = self.next_id;
         self.next_id += 1;
@@ -206,6 +218,16 @@ mod tests {
     }
 
     #[test]
+    fn a_holder_that_did_not_hear_of_its_lease_is_told_again() {
+        let (mut leases, now) = (Leases::<_, ()>::new(KEEP_ALIVE), Instant::now());
+        leases.offer("a");
+        let (lease, _) = leases.acquire("actor-1", now).unwrap();
+        leases.offer("b");
+        assert_eq!(leases.acquire("actor-1", now + KEEP_ALIVE / 2), Some((lease, &"a")));
+        assert!(leases.keep_alive(lease, "actor-1", now + KEEP_ALIVE * 5 / 4), "that prolongs it");
+    }
+
+    #[test]
     fn results_leave_in_the_order_of_the_offers() {
         let (mut leases, now) = (Leases::new(KEEP_ALIVE), Instant::now());
         leases.offer("a");
@@ -239,19 +261,22 @@ mod tests {
             let mut leases = Leases::new(KEEP_ALIVE);
             let mut now = Instant::now();
             let (mut offered, mut taken) = (0u64, Vec::new());
-            let mut held: Vec<u64> = Vec::new();
+            // Leases, and who got them.
+            let mut held: Vec<(u64, u64)> = Vec::new();
             for (action, actor, seconds) in moves {
                 now += Duration::from_secs(seconds);
                 match action {
                     0 => { leases.offer(offered); offered += 1; }
                     1 => if let Some((lease, _)) = leases.acquire(&actor.to_string(), now) {
-                        prop_assert!(!held.contains(&lease), "a lease's number is used once");
-                        held.push(lease);
+                        match held.iter().find(|(known, _)| *known == lease) {
+                            Some((_, holder)) => prop_assert_eq!(*holder, actor, "a lease's number is used once"),
+                            None => held.push((lease, actor)),
+                        }
                     },
-                    2 => if let Some(lease) = held.get(actor as usize) {
+                    2 => if let Some((lease, _)) = held.get(actor as usize) {
                         leases.keep_alive(*lease, &actor.to_string(), now);
                     },
-                    3 => if let Some(lease) = held.get(actor as usize).copied() {
+                    3 => if let Some((lease, _)) = held.get(actor as usize).copied() {
                         let evaluation = leases.held(lease).copied();
                         let accepted = leases.report(lease, evaluation.unwrap_or(u64::MAX)).is_ok();
                         prop_assert_eq!(accepted, evaluation.is_some());

@@ -3,8 +3,9 @@
 //! ```text
 //! runs/<name>/
 //!   config.toml          the whole effective configuration
+//!   lock                 held by the process that trains the run
 //!   incarnation          how often a learner was started on this run
-//!   checkpoints/         step-<env steps>.safetensors, the newest few
+//!   checkpoints/         step-<env steps>-<updates>.safetensors, the newest few
 //!   replay/              the replay's store
 //!   evaluations.jsonl    a line an evaluation
 //!   timings.jsonl        the wall time of the same
@@ -12,7 +13,7 @@
 //!   diverged/            states of simulations that diverged, for `getup rollout`
 //! ```
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
@@ -102,6 +103,25 @@ impl RunFolder {
         Ok(())
     }
 
+    /// Takes the run for this process, until what is returned is dropped: two learners would remove each other's checkpoints.
+    ///
+    /// # Errors
+    /// [`FolderError`] if another process has it.
+    pub fn lock(&self) -> Result<File, FolderError> {
+        let path = self.root.join("lock");
+        let file = File::create(&path).map_err(fault("create", &path))?;
+        match file.try_lock() {
+            Ok(()) => Ok(file),
+            Err(TryLockError::WouldBlock) => {
+                let used = "another process trains this run: end it, or choose another --run";
+                Err(fault("lock", &path)(io::Error::new(io::ErrorKind::ResourceBusy, used)))
+            }
+            // A disk that knows no locks.
+            Err(TryLockError::Error(error)) if error.kind() == io::ErrorKind::Unsupported => Ok(file),
+            Err(TryLockError::Error(error)) => Err(fault("lock", &path)(error)),
+        }
+    }
+
     /// The number of this start of a learner on this run, from 1; every call counts one.
     pub fn next_incarnation(&self) -> Result<u64, FolderError> {
         let path = self.root.join("incarnation");
@@ -119,12 +139,17 @@ impl RunFolder {
     }
 }
 
-/// Appends one JSON line and gets it to the disk's cache before it returns.
+/// Appends one JSON line: whole, or not at all.
 pub fn append_line(path: &Path, line: &impl Serialize) -> Result<(), FolderError> {
     let mut text = serde_json::to_string(line).expect("lines are plain structures of numbers and strings");
     text.push('\n');
     let mut file = OpenOptions::new().create(true).append(true).open(path).map_err(fault("open", path))?;
-    file.write_all(text.as_bytes()).map_err(fault("append to", path))
+    let length = file.metadata().map_err(fault("append to", path))?.len();
+    file.write_all(text.as_bytes()).map_err(|error| {
+        // On a full disk half of it may be there, and the next line would go on from it.
+        let _ = file.set_len(length);
+        fault("append to", path)(error)
+    })
 }
 
 /// Removes what a process that was killed had not finished writing to a folder. Nobody may be writing there.
@@ -174,6 +199,17 @@ mod tests {
         assert!(!cut.exists());
         write_atomically(&run.checkpoints().join("step-1.safetensors"), b"one").unwrap();
         assert!(run.has_checkpoint());
+    }
+
+    #[test]
+    fn a_run_is_one_process_s_at_a_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = RunFolder::new(folder.path());
+        let held = run.lock().unwrap();
+        let error = run.lock().unwrap_err().to_string();
+        assert!(error.contains("another process trains this run"), "{error}");
+        drop(held);
+        run.lock().unwrap();
     }
 
     #[test]

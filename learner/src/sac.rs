@@ -254,7 +254,7 @@ impl Sac {
         let critic_loss = squares.mean_dim(&[1i64][..], false, Kind::Float).sum(Kind::Float);
         let errors = error.abs().mean_dim(&[0i64][..], false, Kind::Float).to_device(Device::Cpu);
         self.td_errors = Vec::try_from(&errors).expect("errors are numbers");
-        let critic = self.finite("critic", critic_loss.double_value(&[]))?;
+        let critic = self.finite("critic loss", critic_loss.double_value(&[]))?;
         let critics_gradient = self.critics.parameters.gradient(&critic_loss);
         lap.add_to(&mut self.phases.critics);
         self.critics_adam.step(&mut self.critics.parameters, &critics_gradient);
@@ -267,7 +267,7 @@ impl Sac {
             let sample = self.actor.forward(&observation).sample(&beta, &matrix(noise));
             let value = self.critics.minimum(&observation, &sample.action);
             let loss = (&sample.log_prob * temperature - value).mean(Kind::Float);
-            let actor = self.finite("actor", loss.double_value(&[]))?;
+            let actor = self.finite("actor loss", loss.double_value(&[]))?;
             let gradient = self.actor.parameters.gradient(&loss);
             lap.add_to(&mut self.phases.actor);
             self.actor_adam.step(&mut self.actor.parameters, &gradient);
@@ -300,21 +300,23 @@ impl Sac {
         let inputs = Inputs { batch, statistics: statistics.as_ref(), next_noise, noise, temperature };
 
         let critic = cpu.critics_backward(&inputs, Values { actor, critics, targets });
-        let critic_loss = self.finite("critic", critic.loss)?;
+        let critic_loss = self.finite("critic loss", critic.loss)?;
         cpu.td_errors(&mut self.td_errors);
         lap.add_to(&mut self.phases.critics);
         let step = self.critics_adam.begin_step();
         let (first, second) = self.critics_adam.moments();
         cpu.critics_step(Flat { values: critics, first, second }, targets, step, self.config.tau as f32);
+        self.finite("critic gradient", cpu.gradient_norms()[0])?;
 
         lap.add_to(&mut self.phases.optimizer);
         if self.actor_learns() {
             let policy = cpu.actor_backward(&inputs, Values { actor, critics, targets });
-            let loss = self.finite("actor", policy.loss)?;
+            let loss = self.finite("actor loss", policy.loss)?;
             lap.add_to(&mut self.phases.actor);
             let step = self.actor_adam.begin_step();
             let (first, second) = self.actor_adam.moments();
             cpu.actor_step(Flat { values: actor, first, second }, step);
+            self.finite("actor gradient", cpu.gradient_norms()[1])?;
             self.actor_learned(loss, policy.value);
             lap.add_to(&mut self.phases.optimizer);
         }

@@ -8,7 +8,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use getup_proto::{PolicyVersion, TraceContext, v1};
+use getup_proto::{PolicyVersion, TraceContext, columns, v1};
 use getup_replay::{Minibatch, MinibatchSource, ReplayCounters, SampleError};
 use getup_telemetry::traces::{KeyValue, SpanKind};
 use getup_telemetry::{Registry, Shutdown, Traces};
@@ -174,7 +174,7 @@ impl Trainer {
         let mut trainer = Self {
             checkpoints: Checkpoints::new(folder.checkpoints(), &config.learner, metrics.clone()),
             pace: Pace::new(sac.updates()),
-            refill: Refill::new(config.sac.refill_steps, config.replays),
+            refill: Refill::new(config.sac.refill_steps, config.replays, hub.waits()),
             version: PolicyVersion { incarnation, counter: 0 },
             ending: curriculum.outcome().map(Ending::Curriculum).or(already_past(&config, &progress)),
             evaluation: None,
@@ -216,12 +216,23 @@ impl Trainer {
     }
 
     /// Trains on minibatches of `source` until the curriculum's end, the last env step, or `shutdown`, and leaves
-    /// a checkpoint.
+    /// a checkpoint; also where the replay refuses to go on, which is not training's fault.
     pub fn run(
         &mut self,
         source: &mut dyn MinibatchSource,
         shutdown: &Shutdown,
     ) -> Result<Ending, TrainError> {
+        let ended = self.train(source, shutdown).and_then(|()| self.finish());
+        if matches!(ended, Err(TrainError::Sample(_) | TrainError::Column(_))) {
+            self.checkpoint();
+            if let Err(error) = self.checkpoints.finish() {
+                tracing::error!(%error, "the last checkpoint was not written");
+            }
+        }
+        ended
+    }
+
+    fn train(&mut self, source: &mut dyn MinibatchSource, shutdown: &Shutdown) -> Result<(), TrainError> {
         let mut asked = Instant::now();
         while self.ending.is_none() && !shutdown.is_triggered() {
             match source.poll(STARVED) {
@@ -246,7 +257,7 @@ impl Trainer {
         if matches!(self.ending, Some(Ending::Steps(_))) {
             self.await_last_reports(shutdown)?;
         }
-        self.finish()
+        Ok(())
     }
 
     /// One update and everything that follows from it.
@@ -268,8 +279,12 @@ impl Trainer {
         let began = (!followed.is_empty()).then(SystemTime::now);
         let env_steps = self.progress.env_steps;
         self.progress.count(&minibatch.counters);
-        if self.refill.goes_on(&minibatch.counters, self.made(), self.hub.waits()) {
+        let refills = self.refill.goes_on(&minibatch.counters, self.made());
+        if refills || self.sac.updates() < self.config.sac.critics_first {
+            // The policy stays as it is.
             self.curriculum.pause(self.progress.env_steps - env_steps);
+        }
+        if refills {
             if self.pace.is_time_to_show() {
                 self.show();
             }
@@ -348,12 +363,13 @@ impl Trainer {
     pub fn finish(&mut self) -> Result<Ending, TrainError> {
         self.take_reports()?;
         let ending = self.ending.unwrap_or(Ending::Shutdown);
+        // First what the run goes on from, whatever becomes of the rest.
+        self.checkpoint();
         let last = self.describe(self.sac.evaluated_policy(), self.curriculum.stage_beta());
         write_atomically(&self.folder.model("last"), &last.to_bytes())?;
         if ending != Ending::Shutdown {
             self.publish_final()?;
         }
-        self.checkpoint();
         self.checkpoints.finish()?;
         self.show();
         Ok(ending)
@@ -450,12 +466,12 @@ impl Batch {
             column.map(|column| std::mem::take(&mut column.data)).ok_or(TrainError::Column(name))
         };
         Ok(Self {
-            observation: column("observation")?,
-            action: column("action")?,
-            reward: column("reward")?,
+            observation: column(columns::OBSERVATION)?,
+            action: column(columns::ACTION)?,
+            reward: column(columns::REWARD)?,
             next_observation: column("next_observation")?,
-            discount: column("discount")?,
-            beta: column("beta")?,
+            discount: column(columns::DISCOUNT)?,
+            beta: column(columns::BETA)?,
             weight: Vec::new(),
         })
     }

@@ -3,61 +3,20 @@
 
 #![cfg(feature = "torch")]
 
-use getup_learner::config::{SacConfig, TargetEntropy};
-use getup_learner::sac::{Batch, Sac, TaskShape};
-use getup_proto::{ColumnSpec, PolicyVersion, Rows, RunSpec, Segment, columns};
+mod toy;
+
+use getup_learner::sac::{Batch, Sac};
 use getup_replay::{
     ItemSelector, LocalSource, MinibatchSource, RemoteOptions, RemoteSource, ReplayConfig, ReplayMetrics,
     SampleOptions, Store, serve,
 };
 use getup_telemetry::{Registry, Shutdown, Waits};
-use rand::{Rng, SeedableRng};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::sync::Arc;
 use tch::Device;
 use tempfile::TempDir;
 use tokio::net::TcpListener;
-
-const STEPS: usize = 16;
-
-fn spec() -> RunSpec {
-    let column = |name: &str, rows| ColumnSpec { name: name.to_owned(), width: 1, rows };
-    RunSpec {
-        run: "toy".to_owned(),
-        task: "line/point".to_owned(),
-        columns: vec![
-            column(columns::OBSERVATION, Rows::StepsPlusOne),
-            column(columns::ACTION, Rows::Steps),
-            column(columns::REWARD, Rows::Steps),
-            column(columns::BETA, Rows::Once),
-        ],
-        max_segment_steps: STEPS,
-    }
-}
-
-/// A point on a line is moved to where the action says, and paid `1 − (position − 0.5)²`; actions are uniform.
-fn segment(sequence: u64, rng: &mut ChaCha8Rng) -> Segment {
-    let positions: Vec<f32> = (0..=STEPS).map(|_| rng.random_range(-1.0..1.0)).collect();
-    let actions = &positions[1..];
-    let rewards: Vec<f32> = actions.iter().map(|action| 1.0 - (action - 0.5).powi(2)).collect();
-    Segment {
-        writer: 1,
-        sequence,
-        lane: 0,
-        episode: sequence,
-        first_step: 0,
-        steps: STEPS,
-        env_steps: STEPS as u32,
-        terminal: false,
-        truncated: false,
-        stage: 0,
-        first_version: PolicyVersion::default(),
-        last_version: PolicyVersion::default(),
-        columns: [&positions[..], actions, &rewards, &[1.0]].map(columns::encode).to_vec(),
-        end: None,
-        trace: None,
-    }
-}
 
 fn store(dir: &TempDir) -> Arc<Store> {
     let registry = Registry::new();
@@ -68,28 +27,15 @@ fn store(dir: &TempDir) -> Arc<Store> {
         ..ReplayConfig::default()
     };
     let (metrics, waits) = (ReplayMetrics::new(&registry), Waits::new(&registry));
-    let store = Store::open(dir.path(), &spec(), &settings, metrics, waits).unwrap();
+    let store = Store::open(dir.path(), &toy::spec(), &settings, metrics, waits).unwrap();
     let mut rng = ChaCha8Rng::seed_from_u64(1);
-    store.append((1..=256).map(|sequence| segment(sequence, &mut rng)).collect()).unwrap();
+    store.append((1..=256).map(|sequence| toy::segment(sequence, &mut rng)).collect()).unwrap();
     Arc::new(store)
 }
 
 /// Trains as a learner does, and checks what it has learned.
 fn learns(mut source: impl MinibatchSource) {
-    let config = SacConfig {
-        hidden: vec![32, 32],
-        batch: 64,
-        gamma: 0.8,
-        tau: 0.02,
-        actor_lr: 1e-3,
-        critic_lr: 3e-3,
-        temperature_lr: 1e-3,
-        initial_temperature: 0.01,
-        target_entropy: TargetEntropy::Nats(-3.0),
-        ..SacConfig::default()
-    };
-    let shape = TaskShape { observation: 1, action: 1, unnormalized: vec![] };
-    let mut sac = Sac::new(&shape, &config, 3, Device::Cpu, 1);
+    let mut sac = Sac::new(&toy::shape(), &toy::config(), 3, Device::Cpu, 1);
     let mut q = 0.0;
     let mut unequal = 0;
     for _ in 0..1500 {
@@ -134,7 +80,7 @@ fn the_toy_task_is_learned_from_a_prioritized_table_over_grpc() {
     let shutdown = Shutdown::new();
     let serving = runtime.spawn(serve(listener, store(&dir), shutdown.clone()));
     let remote = RemoteOptions {
-        spec: spec(),
+        spec: toy::spec(),
         sample: options(),
         name: "learner".to_owned(),
         table: String::new(),

@@ -26,8 +26,8 @@ struct Pages {
     writers: BTreeMap<(usize, u64), Written>,
     /// The last counters of each store.
     counters: BTreeMap<u64, ReplayCounters>,
-    /// Leases that were given, with the policy to evaluate.
-    leases: BTreeMap<u64, PolicyVersion>,
+    /// Leases that were given, with the policy to evaluate and to whom: whoever did not hear of it is told again.
+    leases: BTreeMap<u64, (PolicyVersion, String)>,
     accepted: BTreeSet<u64>,
     counted: BTreeSet<PolicyVersion>,
     counted_leases: BTreeSet<u64>,
@@ -207,8 +207,12 @@ impl Ledger {
 
     /// An actor was given a lease.
     pub(crate) fn leased(&self, machine: &Machine, lease: u64, version: PolicyVersion) {
-        if self.pages().leases.insert(lease, version).is_some() {
-            self.violation(format!("lease {lease:#x} was given twice"));
+        let given = (version, machine.name.clone());
+        let before = self.pages().leases.insert(lease, given.clone());
+        if let Some(before) = before
+            && before != given
+        {
+            self.violation(format!("lease {lease:#x} was given as {before:?} and as {given:?}"));
         }
         self.event(machine, &format!("leases {lease:#x} of policy {version}"));
     }
@@ -227,7 +231,7 @@ impl Ledger {
             return;
         }
         let mut pages = self.pages();
-        if pages.leases.get(&lease) != Some(&version) {
+        if pages.leases.get(&lease).map(|(leased, _)| leased) != Some(&version) {
             pages.violations.push(format!("the result of {version} is that of lease {lease:#x}"));
         }
         if !pages.counted.insert(version) || !pages.counted_leases.insert(lease) {

@@ -1,7 +1,6 @@
 //! The three roles on their machines: all real but for what plays ([`play`]) and what learns ([`crate::trainer`]).
 
 use std::collections::VecDeque;
-use std::future::pending;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -101,7 +100,7 @@ pub(crate) async fn learner(run: Arc<Run>, machine: Arc<Machine>) -> turmoil::Re
     let routes = Routes::new(service(hub.clone(), shutdown.clone()));
     let port = Server::new(Credentials::default(), Limits::default(), Metrics::new(&registry));
     let listener = Port::bind(&machine).await?;
-    tokio::spawn(port.serve(listener, routes, pending()));
+    tokio::spawn(port.serve(listener, routes, Shutdown::new()));
     let mut trainer = Trainer::new(&run, &machine, folder, hub, incarnation, &waits, &shutdown)?;
     loop {
         trainer.turn()?;

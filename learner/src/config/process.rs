@@ -32,22 +32,6 @@ pub enum Device {
     Cuda,
 }
 
-impl std::str::FromStr for Device {
-    type Err = ConfigError;
-
-    fn from_str(text: &str) -> Result<Self, ConfigError> {
-        match text {
-            "cpu" => Ok(Self::Cpu),
-            "cuda" => Ok(Self::Cuda),
-            _ => Err(ConfigError {
-                key: "learner.device",
-                value: text.to_owned(),
-                wanted: "\"cpu\" or \"cuda\"",
-            }),
-        }
-    }
-}
-
 impl Default for LearnerConfig {
     fn default() -> Self {
         Self {

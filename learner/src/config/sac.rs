@@ -65,7 +65,7 @@ pub struct SacConfig {
     pub policy_delay: u64,
     /// Updates at the start that leave the actor as it is: for one that begins trained, with critics that do not.
     pub critics_first: u64,
-    /// Share of the new weights in an average of the actor's at every update; 0 for none. With it, the average is what is
+    /// Share of the new weights in an average of the actor's at every update of it; 0 for none. With it, the average is what is
     /// evaluated and kept as a model, while the actor itself goes on exploring: one that sways from update to update is
     /// better on average than at any one.
     pub actor_average: f64,

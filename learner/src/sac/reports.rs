@@ -65,14 +65,12 @@ impl Lap {
     }
 }
 
-/// A loss that is not a number any more. The networks are those of before the update that found it, or differ
-/// from them by finite steps: the last checkpoint is good.
+/// A loss, or a gradient's norm, that is not a number any more. Nothing of the update that found it was published or saved:
+/// the last checkpoint is good.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error(
-    "the {name} loss is {value} at update {update}; lower its learning rate, or resume the last checkpoint"
-)]
+#[error("the {name} is {value} at update {update}; lower its learning rate, or resume the last checkpoint")]
 pub struct NonFiniteLoss {
-    /// Which loss.
+    /// Of what: a loss, or a gradient.
     pub name: &'static str,
     /// Its value.
     pub value: f64,

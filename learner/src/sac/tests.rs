@@ -236,6 +236,17 @@ fn a_loss_that_is_not_a_number_stops_the_update_and_says_which() {
     batch.reward.fill(f32::INFINITY);
     let before = to_vec(sac.critics.parameters.flat());
     let error = sac.update(&batch).unwrap_err();
-    assert_eq!((error.name, error.update), ("critic", 0));
+    assert_eq!((error.name, error.update), ("critic loss", 0));
     assert_eq!(to_vec(sac.critics.parameters.flat()), before);
+}
+
+#[test]
+fn a_gradient_whose_square_is_no_number_stops_training_while_the_loss_is_still_one() {
+    let shape = TaskShape { observation: 1, action: 1, unnormalized: vec![] };
+    let mut sac = Sac::new(&shape, &toy_config(), 0, Device::Cpu, 1);
+    let mut batch = toy_batch(64, 0.8, &mut ChaCha8Rng::seed_from_u64(0));
+    batch.reward.fill(1e30);
+    let error = sac.update(&batch).unwrap_err();
+    // Autograd, where this processor has no products of ours, squares in float32.
+    assert!(["critic gradient", "critic loss"].contains(&error.name), "{error}");
 }

@@ -1,6 +1,7 @@
 //! What a reported evaluation brings: a line in the run's folder, and the curriculum's decision.
 
 use getup_policy::Policy;
+use getup_proto::names::BETA_VALUE;
 use getup_proto::{PolicyVersion, v1};
 use serde::Serialize;
 
@@ -53,7 +54,7 @@ impl Trainer {
         };
         let rises = share(|episode| episode.rises);
         let stands = share(|episode| episode.stands);
-        let (beta, stage) = (policy.values["beta"], policy.stage);
+        let (beta, stage) = (policy.values[BETA_VALUE], policy.stage);
         let line = EvaluationLine {
             version: PolicyVersion::from(policy.version.unwrap_or_default()).to_string(),
             env_steps: policy.env_steps,
