@@ -1,13 +1,17 @@
 //! The gRPC health service (`grpc.health.v1.Health`), which containers and load balancers probe.
 
-pub use tonic_health::ServingStatus;
-pub use tonic_health::pb::health_server::{Health, HealthServer};
-pub use tonic_health::server::HealthReporter;
+use tonic_health::ServingStatus;
+use tonic_health::pb::health_server::{Health, HealthServer};
 
-/// The health service to add to a role's gRPC server, and the handle that sets what it says.
-///
-/// The overall status, of the empty service name, is serving from the start; a role that drains sets it with
-/// `reporter.set_service_status("", ServingStatus::NotServing)`.
-pub fn health() -> (HealthReporter, HealthServer<impl Health>) {
-    tonic_health::server::health_reporter()
+use crate::Shutdown;
+
+/// The health service to add to a role's gRPC server: serving from the start, and not serving from `shutdown` on, while the
+/// role drains.
+pub fn health(shutdown: Shutdown) -> HealthServer<impl Health> {
+    let (reporter, service) = tonic_health::server::health_reporter();
+    tokio::spawn(async move {
+        shutdown.wait().await;
+        reporter.set_service_status("", ServingStatus::NotServing).await;
+    });
+    service
 }

@@ -159,9 +159,13 @@ async fn metrics(State((shown, _)): State<(Shown, Shutdown)>, headers: HeaderMap
         let how = "a token is needed: send `authorization: Bearer TOKEN` with the one in security.metrics_token_file\n";
         return (StatusCode::UNAUTHORIZED, how).into_response();
     }
-    match TextEncoder::new().encode_to_string(&shown.registry.gather()) {
+    // Some of them are asked of the disk, which may take long: not on a thread that others need.
+    let text = tokio::task::spawn_blocking(move || {
+        TextEncoder::new().encode_to_string(&shown.registry.gather()).map_err(|error| error.to_string())
+    });
+    match text.await.map_err(|error| error.to_string()).flatten() {
         Ok(text) => ([(header::CONTENT_TYPE, TEXT_FORMAT)], text).into_response(),
-        Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
+        Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error).into_response(),
     }
 }
 

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use getup_telemetry::{LogFormat, LoggingError, Registry, Waits, init_logging};
+use getup_telemetry::{LoggingError, Registry, Waits, init_logging};
 
 #[derive(Clone, Default)]
 struct Lines(Arc<Mutex<Vec<u8>>>);
@@ -24,8 +24,8 @@ impl Write for Lines {
 fn a_wait_of_more_than_five_seconds_is_logged_with_who_waits_and_why() {
     let lines = Lines::default();
     let writer = lines.clone();
-    init_logging(LogFormat::Json, move || writer.clone()).unwrap();
-    assert!(matches!(init_logging(LogFormat::Json, io::stderr), Err(LoggingError::Again(_))));
+    init_logging(true, move || writer.clone()).unwrap();
+    assert!(matches!(init_logging(true, io::stderr), Err(LoggingError::Again(_))));
 
     let waits = Waits::new(&Registry::new());
     let guard = waits.begin("sampler", "812 of 1,000 transitions".into());

@@ -1,12 +1,11 @@
 //! The server's end: a port that knows whom it lets in, and how many.
 
-use std::future::Future;
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use getup_telemetry::Backoff;
+use getup_telemetry::{Backoff, Shutdown};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, timeout_at};
 use tokio_rustls::TlsAcceptor;
@@ -24,6 +23,8 @@ use crate::{Credentials, Metrics, Window};
 
 /// A peer that is silent for this long is pinged, and gone after as long again.
 const PING_EVERY: Duration = Duration::from_secs(10);
+/// How long peers have to let go of their connections at a shutdown.
+const GRACE: Duration = Duration::from_secs(3);
 
 /// What a port lets its peers take.
 #[derive(Clone, PartialEq, Debug)]
@@ -69,7 +70,8 @@ impl Server {
         Self { credentials, limits, metrics }
     }
 
-    /// Serves `routes` to whoever connects and may, until `shutdown`; returns when all connections have ended.
+    /// Serves `routes` to whoever connects and may, until `shutdown`; returns when all connections have ended, a few
+    /// seconds after it at the latest.
     ///
     /// # Errors
     /// When tonic fails; a connection that fails ends alone.
@@ -77,7 +79,7 @@ impl Server {
         self,
         listener: impl Listener,
         routes: Routes,
-        shutdown: impl Future<Output = ()>,
+        shutdown: Shutdown,
     ) -> Result<(), tonic::transport::Error> {
         let door = Door { tokens: self.credentials.tokens.clone(), metrics: self.metrics.clone() };
         let (stream, connection) = self.limits.window.bytes();
@@ -98,7 +100,14 @@ impl Server {
             }
         });
         let incoming = ReceiverStream::new(incoming).map(Ok::<_, io::Error>);
-        server.add_routes(routes).serve_with_incoming_shutdown(incoming, shutdown).await
+        let serving = server.add_routes(routes).serve_with_incoming_shutdown(incoming, shutdown.wait());
+        tokio::select! {
+            served = serving => served,
+            () = async { shutdown.wait().await; tokio::time::sleep(GRACE).await } => {
+                tracing::warn!("ending with connections open: their peers did not let go");
+                Ok(())
+            }
+        }
     }
 
     /// Takes connections while there are places for them; each shakes hands by itself, so that none waits for another.

@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 
+use rustls::client::Resumption;
 use rustls::crypto::{CryptoProvider, ring};
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
-use rustls::server::WebPkiClientVerifier;
+use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
 use rustls::{ClientConfig, RootCertStore, ServerConfig};
 
 use crate::SecurityError;
@@ -41,6 +42,9 @@ impl Tls {
             .with_single_cert(chain.clone(), key.clone_key())
             .map_err(unfit)?;
         server.alpn_protocols = vec![ALPN.to_vec()];
+        // A resumed session is not asked for its certificate again, which may have expired since.
+        server.send_tls13_tickets = 0;
+        server.session_storage = Arc::new(NoServerSessionStorage {});
         let mut client = ClientConfig::builder_with_provider(provider())
             .with_protocol_versions(&[&rustls::version::TLS13])
             .expect("the provider knows TLS 1.3")
@@ -48,6 +52,7 @@ impl Tls {
             .with_client_auth_cert(chain, key)
             .map_err(unfit)?;
         client.alpn_protocols = vec![ALPN.to_vec()];
+        client.resumption = Resumption::disabled();
         Ok(Self { client: Arc::new(client), server: Arc::new(server) })
     }
 }

@@ -37,9 +37,8 @@ impl Port {
         let server = Server::new(Credentials::load(config).unwrap(), limits, Metrics::new(&registry));
         let ended = shutdown.clone();
         tokio::spawn(async move {
-            let (_reporter, health) = health();
-            let routes = Routes::new(InterceptedService::new(health, behind_the_door));
-            server.serve(listener, routes, async move { ended.wait().await }).await.unwrap();
+            let routes = Routes::new(InterceptedService::new(health(ended.clone()), behind_the_door));
+            server.serve(listener, routes, ended).await.unwrap();
         });
         Self { address, registry, shutdown }
     }

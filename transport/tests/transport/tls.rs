@@ -97,6 +97,19 @@ async fn a_client_with_certificates_does_not_talk_to_a_port_without() {
 }
 
 #[tokio::test]
+async fn while_the_authority_changes_peers_of_both_are_let_in_and_then_those_of_the_new_one_alone() {
+    let (old, new) = (authority(), authority());
+    let both = old.text("ca.pem") + &new.text("ca.pem");
+    let port = Port::open(&SecurityConfig { ca: old.write("both.pem", &both), ..old.tls() }).await;
+    let peer = SecurityConfig { ca: new.write("both.pem", &both), ..new.tls() };
+    call(&port.channel(&old.tls())).await.unwrap();
+    call(&port.channel(&peer)).await.unwrap();
+    old.write("both.pem", new.text("ca.pem"));
+    eventually(async || call(&port.channel(&old.tls())).await.is_err()).await;
+    call(&port.channel(&peer)).await.unwrap();
+}
+
+#[tokio::test]
 async fn a_renewed_certificate_is_shown_to_new_connections_without_a_restart() {
     let server = authority();
     let peer = another_peer(&server);
