@@ -12,7 +12,7 @@ use getup_transport::{Endpoint, Limits};
 use tonic::service::Routes;
 
 use crate::config::Config;
-use crate::role::{Role, RoleArgs, host_name, serve_grpc};
+use crate::role::{Role, RoleArgs, host_name};
 
 /// Run an actor: simulates episodes under the newest policy, pushes them to the replay, plays leased evaluations.
 ///
@@ -56,9 +56,8 @@ async fn serve(config: &Config, role: &Role, diverged: PathBuf) -> Result<()> {
     role.serve_metrics(&network.actor_metrics).await?;
     let listener = role.bind_grpc(&network.actor).await?;
     tracing::info!(name = config.actor.name, health = %listener.local_addr()?, "actor started");
-    let (_reporter, health) = health();
-    let (port, routes) = (role.port(Limits::default()), Routes::new(health));
-    let server = tokio::spawn(serve_grpc(port, routes, listener, role.shutdown.clone()));
+    let (port, routes) = (role.port(Limits::default()), Routes::new(health(role.shutdown.clone())));
+    let server = tokio::spawn(port.serve(listener, routes, role.shutdown.clone()));
     role.ready.set();
     let result =
         worker::run(setup, writers, link, waits.clone(), role.shutdown.clone(), &role.registry).await;

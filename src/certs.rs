@@ -1,6 +1,7 @@
 //! `getup certs`: certificates for a cluster that has no authority of its own.
 
-use std::path::PathBuf;
+use std::io::Write;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use getup_transport::{Issued, generate_token, make_authority};
@@ -43,15 +44,18 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     );
     let token = dir.join("token");
     if arguments.token && !token.exists() {
-        write_secret(&token).with_context(|| format!("cannot write {}", token.display()))?;
+        write_secret(dir, &token).with_context(|| format!("cannot write {}", token.display()))?;
         println!("{} is new", token.display());
     }
     Ok(())
 }
 
-fn write_secret(path: &std::path::Path) -> std::io::Result<()> {
-    use std::io::Write;
-    use std::os::unix::fs::OpenOptionsExt;
-    let mut file = std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
-    writeln!(file, "{}", generate_token())
+/// Writes a token whole or not at all, for its owner's eyes alone.
+fn write_secret(dir: &Path, path: &Path) -> std::io::Result<()> {
+    // Such files are their owner's from the beginning.
+    let mut file = tempfile::NamedTempFile::new_in(dir)?;
+    writeln!(file, "{}", generate_token())?;
+    file.as_file().sync_all()?;
+    file.persist_noclobber(path)?;
+    Ok(())
 }

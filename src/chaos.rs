@@ -313,6 +313,9 @@ impl Health {
             Value::Array(several) => several.iter().collect(),
             one => vec![one],
         };
+        // What is not there is not 0: a comparison with it would hold for ever.
+        let count =
+            |of: &Value, name: &str| of[name].as_u64().with_context(|| format!("a status without {name}"));
         let mut stores = Vec::new();
         let mut env_steps = 0;
         for replay in replays {
@@ -320,8 +323,8 @@ impl Health {
                 bail!("replay: {error}");
             }
             let store = replay["store"].as_str().context("a replay without a store")?.to_owned();
-            stores.push((store, replay["transitions"].as_u64().unwrap_or(0)));
-            env_steps += replay["env_steps"].as_u64().unwrap_or(0);
+            stores.push((store, count(replay, "transitions")?));
+            env_steps += count(replay, "env_steps")?;
         }
         let learner = &status["learner"];
         if let Some(error) = learner["error"].as_str() {
@@ -334,8 +337,8 @@ impl Health {
         Ok(Self {
             stores,
             env_steps,
-            updates: learner["updates"].as_u64().unwrap_or(0),
-            stage: learner["stage"].as_u64().unwrap_or(0),
+            updates: count(learner, "updates")?,
+            stage: count(learner, "stage")?,
             version: (incarnation.parse()?, counter.parse()?),
             actors: learner["actors"].as_array().map_or(0, |actors| actors.iter().filter(heard).count()),
             finished: learner["state"] == "finished",
@@ -401,6 +404,22 @@ mod tests {
         assert!(missing(health(101, 10, &[0.1, 0.2])).unwrap().contains("no update"));
         assert!(missing(health(100, 11, &[0.1, 0.2])).unwrap().contains("no env step"));
         assert!(missing(health(101, 11, &[0.1, 30.0])).unwrap().contains("1 of 2 actors"));
+    }
+
+    #[test]
+    fn a_status_that_lacks_what_is_compared_is_none() {
+        let whole = json!({
+            "replay": {"store": "a", "transitions": 1, "env_steps": 1},
+            "learner": {"version": "2.7", "updates": 1, "stage": 1, "state": "training", "actors": []},
+        });
+        assert!(Health::of(&whole).is_ok());
+        for (role, name) in
+            [("replay", "transitions"), ("replay", "env_steps"), ("learner", "updates"), ("learner", "stage")]
+        {
+            let mut status = whole.clone();
+            status[role].as_object_mut().unwrap().remove(name);
+            assert!(Health::of(&status).unwrap_err().to_string().contains(name), "{role} without {name}");
+        }
     }
 
     #[test]

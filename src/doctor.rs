@@ -1,8 +1,6 @@
 //! `getup doctor`: checks this machine and a configuration before a run does.
 
-use std::ffi::CString;
 use std::net::TcpListener;
-use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -139,18 +137,8 @@ fn ports(config: &Config) -> Result<String> {
 
 fn disk(run: &Path) -> Result<String> {
     let folder = run.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("."));
-    let path =
-        CString::new(folder.as_os_str().as_bytes()).context("the run's folder has a NUL in its name")?;
-    // SAFETY: an all-zero statvfs is a valid value of that plain structure, `path` is NUL-terminated, and the
-    // structure outlives the call.
-    let (result, facts) = unsafe {
-        let mut facts: libc::statvfs = std::mem::zeroed();
-        (libc::statvfs(path.as_ptr(), &mut facts), facts)
-    };
-    if result != 0 {
-        return Err(std::io::Error::last_os_error())
-            .with_context(|| format!("cannot measure {}", folder.display()));
-    }
+    let facts =
+        rustix::fs::statvfs(folder).with_context(|| format!("cannot measure {}", folder.display()))?;
     let free = facts.f_bavail * facts.f_frsize;
     let gib = free as f64 / GIB as f64;
     if free < 2 * GIB {

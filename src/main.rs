@@ -24,6 +24,8 @@ mod render;
 mod replay;
 mod role;
 mod rollout;
+#[cfg(feature = "learner")]
+mod run;
 mod settings;
 mod status;
 #[cfg(feature = "learner")]

@@ -9,13 +9,11 @@ use std::time::Duration;
 use anyhow::{Context, Result};
 use getup_telemetry::traces::Recorder;
 use getup_telemetry::{
-    LogFormat, Ready, Registry, Shown, Shutdown, Traces, Waits, build_info, init_logging, registry,
-    serve_http,
+    Ready, Registry, Shown, Shutdown, Traces, Waits, build_info, init_logging, registry, serve_http,
 };
 use getup_transport::{Credentials, Limits, Metrics, SecurityConfig, Server, require_protection};
 use indicatif::MultiProgress;
 use tokio::net::TcpListener;
-use tonic::service::Routes;
 
 use crate::config::{Config, ConfigArgs};
 
@@ -29,9 +27,18 @@ const OTHER_FILES: usize = 1024;
 pub(crate) struct RoleArgs {
     #[command(flatten)]
     pub(crate) config: ConfigArgs,
-    /// How log lines are written: pretty or json.
+    /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "pretty")]
     pub(crate) log_format: LogFormat,
+}
+
+/// How log lines are written.
+#[derive(clap::ValueEnum, Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) enum LogFormat {
+    /// A readable line an event, in colour on a terminal.
+    Pretty,
+    /// A JSON object a line.
+    Json,
 }
 
 /// A process in the making: what its parts share.
@@ -60,7 +67,7 @@ impl Role {
     pub(crate) fn new(name: &str, config: &Config, log_format: LogFormat) -> Result<Self> {
         let progress = MultiProgress::new();
         let writer = progress.clone();
-        init_logging(log_format, move || LogWriter(writer.clone()))?;
+        init_logging(log_format == LogFormat::Json, move || LogWriter(writer.clone()))?;
         raise_open_files(config.network.connections);
         let registry = registry(&config.run);
         build_info(&registry, name);
@@ -133,24 +140,6 @@ impl Role {
     }
 }
 
-/// Serves until shutdown, and then for as long as peers need to let go, but no longer than [`GRACE`].
-pub(crate) async fn serve_grpc(
-    port: Server,
-    routes: Routes,
-    listener: TcpListener,
-    shutdown: Shutdown,
-) -> Result<()> {
-    let (ended, late) = (shutdown.clone(), shutdown);
-    let serving = port.serve(listener, routes, async move { ended.wait().await });
-    tokio::select! {
-        served = serving => Ok(served?),
-        () = async { late.wait().await; tokio::time::sleep(GRACE).await } => {
-            tracing::warn!("ending with connections open: their peers did not let go");
-            Ok(())
-        }
-    }
-}
-
 /// Binds a listener, or says which address could not be had and what to do.
 pub(crate) async fn bind(address: &str, what: &str) -> Result<TcpListener> {
     TcpListener::bind(address).await.with_context(|| {
@@ -175,12 +164,8 @@ fn raise_open_files(connections: usize) {
 
 /// This machine's name, as logs and traces show it.
 pub(crate) fn host_name() -> String {
-    let mut buffer = [0u8; 256];
-    // SAFETY: the buffer is valid for its length, of which one byte is kept for the terminator.
-    let result = unsafe { libc::gethostname(buffer.as_mut_ptr().cast(), buffer.len() - 1) };
-    let length = buffer.iter().position(|byte| *byte == 0).unwrap_or(0);
-    match std::str::from_utf8(&buffer[..length]) {
-        Ok(name) if result == 0 && !name.is_empty() => name.to_owned(),
+    match rustix::system::uname().nodename().to_str() {
+        Ok(name) if !name.is_empty() => name.to_owned(),
         _ => "host".to_owned(),
     }
 }

@@ -9,18 +9,16 @@ use std::sync::Arc;
 use anyhow::{Context, Result, bail, ensure};
 use getup_actor::identity::Identity;
 use getup_actor::worker;
-use getup_learner::config::Device;
 use getup_learner::curriculum::Outcome;
 use getup_learner::device;
-use getup_learner::run_folder::{RunFolder, write_atomically};
+use getup_learner::run_folder::RunFolder;
 use getup_learner::trainer::{Ending, Start};
 use getup_replay::{LocalSource, ReplayMetrics, Store};
-use getup_telemetry::LogFormat;
 
 use crate::config::{Config, ConfigArgs};
-use crate::learner::{check_run, load_beginning, make_hub, make_trainer, sample_options};
 use crate::links::{HubLink, StoreWriter};
-use crate::role::Role;
+use crate::role::{LogFormat, Role};
+use crate::run::{check_run, load_beginning, make_hub, make_trainer, note_config, sample_options};
 
 /// Train a character in one process: simulation, replay, learner and curriculum.
 ///
@@ -52,8 +50,8 @@ pub(crate) struct Args {
     deterministic: bool,
     /// cpu, or cuda for the first NVIDIA device. [default: the preset's]
     #[arg(long)]
-    device: Option<Device>,
-    /// How log lines are written: pretty or json.
+    device: Option<String>,
+    /// How log lines are written.
     #[arg(long, value_name = "FORMAT", default_value = "pretty")]
     log_format: LogFormat,
 }
@@ -83,9 +81,7 @@ fn prepare(arguments: &mut Args) -> Result<(Config, RunFolder)> {
     let shorthands = [
         arguments.seed.map(|seed| format!("seed={seed}")),
         arguments.steps.map(|steps| format!("steps={steps}")),
-        arguments
-            .device
-            .map(|device| format!("learner.device={}", if device == Device::Cuda { "cuda" } else { "cpu" })),
+        arguments.device.as_ref().map(|device| format!("learner.device={device}")),
     ];
     arguments.config.set.extend(shorthands.into_iter().flatten());
     if arguments.resume {
@@ -140,11 +136,6 @@ fn prepare_resumed(arguments: &mut Args) -> Result<(Config, RunFolder)> {
     Ok((config, folder))
 }
 
-/// Notes the configuration, once everything has accepted it: a refused change leaves the run as it was.
-fn note_config(config: &Config, folder: &RunFolder) -> Result<()> {
-    Ok(write_atomically(&folder.config(), config.to_toml()?.as_bytes())?)
-}
-
 /// A run that has no name of its own is called like its folder.
 fn name_after_folder(config: &mut Config, path: &Path) {
     if config.run == Config::default().run
@@ -159,6 +150,7 @@ async fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_
     serve_metrics(config, role).await?;
     let spec = config.run_spec()?;
     folder.create()?;
+    let _lock = folder.lock()?;
     let store = open_store(config, role, folder)?;
     let (hub, incarnation) = make_hub(config, role, folder)?;
     let mut trainer =

@@ -1,5 +1,7 @@
 //! What `deploy/` holds, against the schemas of those who read it: Grafana, Kubernetes, Compose.
 
+mod common;
+
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -24,12 +26,12 @@ fn check(kind: &str, files: &[PathBuf]) {
     let script = root().join("tests/manifests.py");
     let output = match Command::new(&python).arg(script).arg(kind).args(files).output() {
         Ok(output) => output,
-        Err(error) => return println!("not checked: {kind}; {python} does not start: {error}"),
+        Err(error) => return common::skip(format!("{kind}: {python} does not start: {error}")),
     };
     let said = String::from_utf8_lossy(&output.stdout);
     match output.status.code() {
         Some(0) => {}
-        Some(SKIPPED) => println!("not checked: {kind}; {python}: {said}"),
+        Some(SKIPPED) => common::skip(format!("{kind}: {python}: {said}")),
         _ => panic!("{said}{}", String::from_utf8_lossy(&output.stderr)),
     }
 }
@@ -56,12 +58,12 @@ fn kubernetes_would_take_the_manifests() {
         let output = match Command::new("kubectl").arg("kustomize").arg(&path).output() {
             Ok(output) => output,
             Err(error) => {
-                return println!("not checked: manifests of Kubernetes; kubectl does not start: {error}");
+                return common::skip(format!("manifests of Kubernetes: kubectl does not start: {error}"));
             }
         };
         let stderr = String::from_utf8_lossy(&output.stderr);
         if !output.status.success() && kubectl_is_old() {
-            return println!("not checked: manifests of Kubernetes; kubectl is older than 1.22");
+            return common::skip("manifests of Kubernetes: kubectl is older than 1.22");
         }
         assert!(output.status.success(), "{place}: {stderr}");
         let file = folder.path().join(place.replace('/', "-") + ".yaml");

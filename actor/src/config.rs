@@ -48,12 +48,18 @@ impl Default for ActorConfig {
     }
 }
 
+/// The longest name of an actor.
+const MAX_NAME_BYTES: usize = 256;
+
 /// A setting that is out of range.
 #[derive(Clone, PartialEq, Debug, Error)]
 pub enum ConfigError {
     /// The actor has no name.
     #[error("actor.name is empty: name the actor, for example \"actor-1\"")]
     Name,
+    /// A name that no learner takes.
+    #[error("actor.name has {0} bytes: it must have at most {MAX_NAME_BYTES}")]
+    LongName(usize),
     /// A number that must be at least 1.
     #[error("actor.{0} is 0: it must be at least 1")]
     Zero(&'static str),
@@ -94,6 +100,9 @@ impl ActorConfig {
         if self.name.is_empty() {
             return Err(ConfigError::Name);
         }
+        if self.name.len() > MAX_NAME_BYTES {
+            return Err(ConfigError::LongName(self.name.len()));
+        }
         let counts = [
             ("lanes", self.lanes),
             ("threads", self.threads),
@@ -104,7 +113,13 @@ impl ActorConfig {
         if let Some((name, _)) = counts.into_iter().find(|(_, count)| *count == 0) {
             return Err(ConfigError::Zero(name));
         }
-        let bounded = [("fall_pool", self.fall_pool, 100_000), ("noise_hold", self.noise_hold, 1_000)];
+        let bounded = [
+            ("lanes", self.lanes, 65_536),
+            ("threads", self.threads, 256),
+            ("queue_segments", self.queue_segments, 1_000_000),
+            ("fall_pool", self.fall_pool, 100_000),
+            ("noise_hold", self.noise_hold, 1_000),
+        ];
         if let Some((name, value, most)) = bounded.into_iter().find(|(_, value, most)| value > most) {
             return Err(ConfigError::TooMany { name, value, most });
         }
@@ -138,6 +153,9 @@ mod tests {
         assert!(refused(&|c| c.threads = 17).contains("actor.threads is 17 and actor.lanes is 16"));
         assert!(refused(&|c| c.drain_seconds = f64::NAN).contains("actor.drain_seconds is NaN"));
         assert!(refused(&|c| c.fall_pool = usize::MAX).contains("it must be at most 100000"));
+        assert!(refused(&|c| c.name = "a".repeat(257)).contains("actor.name has 257 bytes"));
+        assert!(refused(&|c| (c.lanes, c.threads) = (1000, 1000)).contains("actor.threads is 1000"));
+        assert!(refused(&|c| c.queue_segments = usize::MAX).contains("it must be at most 1000000"));
         assert!(refused(&|c| c.noise_hold = 0).contains("actor.noise_hold is 0"));
         assert!(refused(&|c| c.fall_renewal = 0.0).contains("actor.fall_renewal is 0"));
     }

@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use getup_policy::{Forward, Policy, squash};
 use getup_sim::rollout::{DivergedAt, Rollout, RolloutFile};
-use getup_sim::{GetUp, Lane, Phase, SimError, Task, TaskConfig, UP_HEIGHT};
+use getup_sim::{GetUp, Lane, SimError, Task, TaskConfig, UP_HEIGHT};
 use thiserror::Error;
 
 use crate::link::EpisodeResult;
@@ -272,11 +272,7 @@ impl Player {
     /// Plays the fall that `seed` determines.
     fn fall(&mut self, seed: u64) -> Fall {
         self.lane.begin(seed, 1.0);
-        while self.lane.phase() == Phase::Limp {
-            self.lane.limp_action(&mut self.action);
-            let step = self.lane.step(&self.action);
-            step.map_err(|diverged| format!("the fall: {}", diverged.cause))?;
-        }
+        self.lane.fall().map_err(|diverged| format!("the fall: {}", diverged.cause))?;
         Ok(Arc::new(Landed { qpos: self.lane.qpos().to_vec(), qvel: self.lane.qvel().to_vec() }))
     }
 
@@ -310,10 +306,7 @@ impl Player {
                 episode.episode_return += self.lane.reward();
                 episode.head_heights.push(self.lane.head_height());
                 if let Some(rollout) = rollout {
-                    rollout.observations.push(self.lane.observation().to_vec());
-                    rollout.rewards.push(self.lane.reward());
-                    rollout.terms.push(self.lane.terms().to_vec());
-                    rollout.qpos.push(self.lane.qpos().to_vec());
+                    rollout.push_step(&self.lane);
                 }
                 step.terminal || step.truncated
             }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use getup_proto::RunSpec;
-use getup_sim::{GetUp, TaskConfig};
+use getup_sim::{GetUp, SimError, TaskConfig};
 use getup_telemetry::{Registry, Shutdown, Traces, Waits};
 use tokio::runtime::Handle;
 use tokio::sync::{mpsc, watch};
@@ -42,6 +42,30 @@ pub struct ActorSetup {
     pub diverged_folder: PathBuf,
     /// What follows some of its segments.
     pub traces: Traces,
+}
+
+impl ActorSetup {
+    /// What its lanes have in common, counted by `metrics`.
+    ///
+    /// # Errors
+    /// [`SimError`] where the task or its character cannot be made.
+    pub fn lane_settings(&self, metrics: ActorMetrics) -> Result<LaneSettings, SimError> {
+        Ok(LaneSettings {
+            task: Arc::new(GetUp::new(&self.task, self.control_limit())?),
+            config: self.config.clone(),
+            spec: self.spec.clone(),
+            identity: self.identity.clone(),
+            beta: self.beta,
+            diverged_folder: self.diverged_folder.clone(),
+            metrics,
+            traces: self.traces.clone(),
+        })
+    }
+
+    /// The actuators' clamp, over their own: for a start that is stronger than the character.
+    fn control_limit(&self) -> f64 {
+        self.beta.ceiling.max(1.0)
+    }
 }
 
 /// Runs an actor until `shutdown`, which then takes up to `drain_seconds`. Its segments are spread over `writers`, each
@@ -153,20 +177,10 @@ pub struct Playing {
 impl Playing {
     /// Starts the threads of lanes.
     fn start(self, setup: &ActorSetup) -> Result<JoinSet<Result<(), ActorError>>, ActorError> {
-        let control_limit = setup.beta.ceiling.max(1.0);
-        let settings = LaneSettings {
-            task: Arc::new(GetUp::new(&setup.task, control_limit)?),
-            config: setup.config.clone(),
-            spec: setup.spec.clone(),
-            identity: setup.identity.clone(),
-            beta: setup.beta,
-            diverged_folder: setup.diverged_folder.clone(),
-            metrics: self.metrics,
-            traces: setup.traces.clone(),
-        };
+        let settings = setup.lane_settings(self.metrics)?;
         let desk = EvaluationDesk {
             task: setup.task.clone(),
-            control_limit,
+            control_limit: setup.control_limit(),
             leases: self.leases,
             reports: self.reports,
             evaluator: None,

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use crate::config::TaskConfig;
 use crate::error::SimError;
 use crate::getup::GetUp;
-use crate::lane::{Diverged, Lane, Phase};
+use crate::lane::{Diverged, Lane};
 use crate::task::Task;
 use crate::world::World;
 
@@ -162,13 +162,7 @@ fn play_all(task: &Arc<dyn Task>, seeds: &[u64]) -> Result<Vec<Landed>, FallsErr
 fn play(lane: &mut Lane, seed: u64) -> Result<Landed, FallsError> {
     lane.begin(seed, 1.0);
     let initial_qpos = lane.qpos().to_vec();
-    let mut action = vec![0.0; lane.world().nu()];
-    let mut limp_steps = 0;
-    while lane.phase() == Phase::Limp {
-        lane.limp_action(&mut action);
-        lane.step(&action).map_err(Box::new)?;
-        limp_steps += 1;
-    }
+    let limp_steps = lane.fall().map_err(Box::new)?;
     let [qpos, qvel] = [lane.qpos().to_vec(), lane.qvel().to_vec()];
     Ok(Landed { seed, initial_qpos, qpos, qvel, limp_steps, landing: Landing::of(lane.world())? })
 }

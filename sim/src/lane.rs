@@ -178,6 +178,21 @@ impl Lane {
         }
     }
 
+    /// Plays the limp steps of an episode to their end; how many there were.
+    ///
+    /// # Errors
+    /// As [`step`](Lane::step).
+    pub fn fall(&mut self) -> Result<usize, Diverged> {
+        let mut action = vec![0.0; self.task.action_width()];
+        let mut limp_steps = 0;
+        while self.phase() == Phase::Limp {
+            self.limp_action(&mut action);
+            self.step(&action)?;
+            limp_steps += 1;
+        }
+        Ok(limp_steps)
+    }
+
     /// Plays one control step.
     ///
     /// `action`: one number a motor, in units of its torque limit; the motors clamp it.

@@ -127,10 +127,7 @@ fn replay_one(
             played.diverged = Some(DivergedAt { step, cause: diverged.cause.to_string() });
             break;
         }
-        played.observations.push(lane.observation().to_vec());
-        played.rewards.push(lane.reward());
-        played.terms.push(lane.terms().to_vec());
-        played.qpos.push(lane.qpos().to_vec());
+        played.push_step(lane);
     }
     Ok(played)
 }
@@ -146,6 +143,16 @@ fn check_action(action: &[f64], wanted: usize, rollout: usize, step: usize) -> R
             Err(RolloutError::NotFinite { rollout, field, got: action[at] })
         }
         None => Ok(()),
+    }
+}
+
+impl Rollout {
+    /// Records where a control step led.
+    pub fn push_step(&mut self, lane: &Lane) {
+        self.observations.push(lane.observation().to_vec());
+        self.rewards.push(lane.reward());
+        self.terms.push(lane.terms().to_vec());
+        self.qpos.push(lane.qpos().to_vec());
     }
 }
 

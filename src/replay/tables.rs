@@ -3,9 +3,9 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use getup_proto::{ColumnSpec, RunSpec};
-use getup_replay::{ReplayConfig, ReplayMetrics, Store, Tables, check_table_name};
+use getup_replay::{DEFAULT_TABLE, ReplayConfig, ReplayMetrics, Store, Tables, check_table_name};
 
 use crate::role::Role;
 
@@ -43,6 +43,7 @@ fn parse(text: &str, run: &RunSpec) -> Result<Vec<TableConfig>> {
     let table = |(name, value): (String, toml::Value)| {
         let parse = || -> Result<TableConfig> {
             check_table_name(&name)?;
+            ensure!(name != DEFAULT_TABLE, "it is the run's own: its settings are those of [replay]");
             let mut settings: toml::Table =
                 value.try_into().context("a table has settings, such as capacity")?;
             let mut spec = run.clone();
@@ -109,6 +110,7 @@ mod tests {
     #[test]
     fn what_is_wrong_is_named() {
         for (text, named) in [
+            ("[default]\ncapacity = 1000", "it is the run's own"),
             ("[Upper]", "`Upper` cannot name a table"),
             ("[a]\nsize = 3", "unknown field `size`"),
             ("[a]\ncapacity = 3", "replay.capacity is 3"),

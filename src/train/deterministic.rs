@@ -10,7 +10,7 @@ use std::time::Instant;
 use anyhow::Result;
 use getup_actor::evaluate::{EvaluateError, Evaluator};
 use getup_actor::identity::Identity;
-use getup_actor::lanes::{LaneGroup, LaneSettings};
+use getup_actor::lanes::LaneGroup;
 use getup_actor::link::{Heartbeat, Lease, PolicyUpdate};
 use getup_actor::metrics::ActorMetrics;
 use getup_actor::sending::Sending;
@@ -20,27 +20,29 @@ use getup_learner::hub::Hub;
 use getup_learner::run_folder::RunFolder;
 use getup_learner::trainer::{Ending, Start, Trainer};
 use getup_proto::v1;
-use getup_replay::{SampleOptions, Sampler, Store};
-use getup_sim::GetUp;
+use getup_replay::{SampleOptions, Store};
 use getup_telemetry::Traces;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 use tokio::sync::watch;
 
+use super::open_store;
 use super::progress::Progress;
-use super::{note_config, open_store};
 use crate::config::Config;
-use crate::learner::{make_hub, make_trainer, sample_options};
 use crate::role::Role;
+use crate::run::{make_hub, make_trainer, note_config, sample_options};
 
 pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_>) -> Result<Ending> {
-    // Sums over threads depend on their number.
+    // Sums over threads depend on their number. What is noted of the run is what was asked for.
     let learner = LearnerConfig { threads: 1, ..config.learner.clone() };
-    let config = &Config { learner, ..config.clone() };
+    let (noted, config) = (config, &Config { learner, ..config.clone() });
     let device = device::open(config.learner.device, 1)?;
     folder.create()?;
+    let _lock = folder.lock()?;
     let store = open_store(config, role, folder)?;
     let (hub, incarnation) = make_hub(config, role, folder)?;
     let trainer = make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, start)?;
-    note_config(config, folder)?;
+    note_config(noted, folder)?;
     let bar = Progress::start(role, config, Arc::clone(&hub));
     let identity =
         Identity::of_start(&config.actor.name, config.seed, incarnation, |writer| store.knows(writer));
@@ -49,20 +51,11 @@ pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Sta
     store.check_options(&options)?;
     let policies = hub.subscribe(&setup.spec)?;
     let policy = Arc::new(PolicyUpdate::parse(v1::PolicyUpdate::clone(&policies.borrow()))?);
-    let settings = LaneSettings {
-        task: Arc::new(GetUp::new(&setup.task, config.control_limit())?),
-        config: setup.config,
-        spec: setup.spec,
-        identity: setup.identity,
-        beta: setup.beta,
-        diverged_folder: setup.diverged_folder,
-        metrics: ActorMetrics::new(&role.registry, &config.actor.name),
-        traces: setup.traces,
-    };
+    let settings = setup.lane_settings(ActorMetrics::new(&role.registry, &config.actor.name))?;
     let mut turns = Turns {
         evaluator: Evaluator::new(&config.task, config.control_limit(), config.evaluation.episodes)?,
         lanes: LaneGroup::new(settings, 0, config.actor.lanes, policy)?,
-        sampler: Sampler::new(options.seed),
+        draws: ChaCha8Rng::seed_from_u64(options.seed),
         name: config.actor.name.clone(),
         traces: role.traces.clone(),
         sequence: 0,
@@ -90,7 +83,8 @@ struct Turns {
     hub: Arc<Hub>,
     policies: watch::Receiver<Arc<v1::PolicyUpdate>>,
     store: Arc<Store>,
-    sampler: Sampler,
+    /// Which transitions are sampled.
+    draws: ChaCha8Rng,
     options: SampleOptions,
     trainer: Trainer,
     lanes: LaneGroup,
@@ -117,7 +111,7 @@ impl Turns {
     /// As many updates as the limiter lets through.
     fn update(&mut self, role: &Role) -> Result<()> {
         while self.trainer.ending().is_none() && !role.shutdown.is_triggered() {
-            match self.store.try_sample(&mut self.sampler, &self.options)? {
+            match self.store.try_sample(&mut self.draws, &self.options)? {
                 Some(minibatch) => {
                     let priorities = self.trainer.tick(minibatch)?;
                     self.store.update_priorities(&priorities)?;

@@ -7,23 +7,13 @@ use crate::support::{setup, spec, update};
 use getup_actor::{ActorMetrics, ActorSetup, LaneGroup, LaneSettings, PolicyUpdate};
 use getup_policy::{Body, Policy, PolicyShape};
 use getup_proto::{Segment, columns};
-use getup_sim::GetUp;
 use getup_sim::rollout::{RolloutFile, replay};
-use getup_telemetry::{Registry, Traces};
+use getup_telemetry::Registry;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 fn settings(setup: &ActorSetup) -> LaneSettings {
-    LaneSettings {
-        task: Arc::new(GetUp::new(&setup.task, setup.beta.ceiling).unwrap()),
-        config: setup.config.clone(),
-        spec: setup.spec.clone(),
-        identity: setup.identity.clone(),
-        beta: setup.beta,
-        diverged_folder: setup.diverged_folder.clone(),
-        metrics: ActorMetrics::new(&Registry::new(), "actor"),
-        traces: Traces::default(),
-    }
+    setup.lane_settings(ActorMetrics::new(&Registry::new(), "actor")).unwrap()
 }
 
 fn play(
@@ -105,7 +95,9 @@ fn uniform_actions_fill_the_torque_limit_of_their_episode_and_do_not_exceed_it()
     let folder = tempfile::tempdir().unwrap();
     let settings = settings(&setup(folder.path()));
     let segments = play(&settings, 0..4, PolicyUpdate { uniform: true, ..update(1) }, 200);
-    for segment in segments.iter().filter(|segment| segment.env_steps > 0) {
+    let played: Vec<&Segment> = segments.iter().filter(|segment| segment.env_steps > 0).collect();
+    assert!(!played.is_empty());
+    for segment in played {
         let beta = columns::iter(&segment.columns[3]).next().unwrap();
         let largest = columns::iter(&segment.columns[1]).map(f32::abs).fold(0.0, f32::max);
         assert!((0.4..=1.0).contains(&beta) && largest <= beta && largest > 0.9 * beta);
