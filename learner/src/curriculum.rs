@@ -156,7 +156,7 @@ impl Curriculum {
         env_steps.saturating_sub(self.stage_start)
     }
 
-    /// So many env steps count neither for the stage nor for a fixed β's patience: nothing was learned from them.
+    /// So many env steps count neither for the stage nor for a fixed β's patience: the policy did not change.
     pub fn pause(&mut self, env_steps: u64) {
         self.stage_start += env_steps;
         if let Some(best) = &mut self.best {

@@ -85,15 +85,11 @@ impl<T, R> Leases<T, R> {
     }
 
     /// The oldest evaluation nobody holds, now leased to `holder`, with the lease's number. One who holds a lease already did
-    /// not hear of it: it is told again.
+    /// not hear of it: it is told again, for what is left of the lease.
     pub fn acquire(&mut self, holder: &str, now: Instant) -> Option<(u64, &T)> {
         self.expire(now);
-        let until = now + self.keep_alive;
-        let held = self.table.iter_mut().enumerate().find_map(|(index, (_, state))| match state {
-            State::Leased { id, holder: held_by, expires } if held_by == holder => {
-                *expires = until;
-                Some((*id, index))
-            }
+        let held = self.table.iter().enumerate().find_map(|(index, (_, state))| match state {
+            State::Leased { id, holder: held_by, .. } if held_by == holder => Some((*id, index)),
             _ => None,
         });
         if let Some((id, index)) = held {
@@ -224,7 +220,11 @@ mod tests {
         let (lease, _) = leases.acquire("actor-1", now).unwrap();
         leases.offer("b");
         assert_eq!(leases.acquire("actor-1", now + KEEP_ALIVE / 2), Some((lease, &"a")));
-        assert!(leases.keep_alive(lease, "actor-1", now + KEEP_ALIVE * 5 / 4), "that prolongs it");
+        // One that never hears of it does not keep it for ever.
+        let late = now + KEEP_ALIVE;
+        let (other, evaluation) = leases.acquire("actor-2", late).unwrap();
+        assert!(other != lease && *evaluation == "a");
+        assert_eq!(leases.acquire("actor-1", late).unwrap().1, &"b");
     }
 
     #[test]

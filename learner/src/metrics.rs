@@ -88,7 +88,7 @@ impl LearnerMetrics {
             weight_norm: by_network("weight_norm", "Euclidean norm of the weights, by network."),
             loss_not_finite: whole(
                 "loss_not_finite",
-                "1 once training stopped because a loss was no number any more.",
+                "1 once training stopped because a loss or a gradient was no number any more.",
             ),
             critic_loss: gauge("critic_loss", "Mean squared error of the critics, summed over them."),
             actor_loss: unknown(

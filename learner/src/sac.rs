@@ -254,8 +254,10 @@ impl Sac {
         let critic_loss = squares.mean_dim(&[1i64][..], false, Kind::Float).sum(Kind::Float);
         let errors = error.abs().mean_dim(&[0i64][..], false, Kind::Float).to_device(Device::Cpu);
         self.td_errors = Vec::try_from(&errors).expect("errors are numbers");
-        let critic = self.finite("critic loss", critic_loss.double_value(&[]))?;
         let critics_gradient = self.critics.parameters.gradient(&critic_loss);
+        let [critic, norm] = numbers([&critic_loss, &critics_gradient.norm()]);
+        self.finite("critic loss", critic)?;
+        self.finite("critic gradient", norm)?;
         lap.add_to(&mut self.phases.critics);
         self.critics_adam.step(&mut self.critics.parameters, &critics_gradient);
         lap.add_to(&mut self.phases.optimizer);
@@ -267,8 +269,10 @@ impl Sac {
             let sample = self.actor.forward(&observation).sample(&beta, &matrix(noise));
             let value = self.critics.minimum(&observation, &sample.action);
             let loss = (&sample.log_prob * temperature - value).mean(Kind::Float);
-            let actor = self.finite("actor loss", loss.double_value(&[]))?;
             let gradient = self.actor.parameters.gradient(&loss);
+            let [actor, norm] = numbers([&loss, &gradient.norm()]);
+            self.finite("actor loss", actor)?;
+            self.finite("actor gradient", norm)?;
             lap.add_to(&mut self.phases.actor);
             self.actor_adam.step(&mut self.actor.parameters, &gradient);
             self.gradients[1] = Some(gradient);
@@ -400,6 +404,12 @@ impl Sac {
     fn finite(&self, name: &'static str, value: f64) -> Result<f64, NonFiniteLoss> {
         if value.is_finite() { Ok(value) } else { Err(NonFiniteLoss { name, value, update: self.updates }) }
     }
+}
+
+/// Single numbers of a device, brought here at once.
+fn numbers<const N: usize>(tensors: [&Tensor; N]) -> [f64; N] {
+    let together = Tensor::stack(&tensors, 0).to_device(Device::Cpu);
+    std::array::from_fn(|index| together.double_value(&[index as i64]))
 }
 
 #[cfg(test)]

@@ -223,7 +223,8 @@ impl Trainer {
         shutdown: &Shutdown,
     ) -> Result<Ending, TrainError> {
         let ended = self.train(source, shutdown).and_then(|()| self.finish());
-        if matches!(ended, Err(TrainError::Sample(_) | TrainError::Column(_))) {
+        let refused = matches!(ended, Err(TrainError::Sample(_) | TrainError::Column(_)));
+        if refused && self.sac.updates() > 0 {
             self.checkpoint();
             if let Err(error) = self.checkpoints.finish() {
                 tracing::error!(%error, "the last checkpoint was not written");

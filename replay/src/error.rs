@@ -49,6 +49,12 @@ pub enum StoreError {
         /// Where it is.
         dir: PathBuf,
     },
+    /// A snapshot of that name is there.
+    #[error("there is a snapshot {dir} already: take another name, or remove it")]
+    SnapshotExists {
+        /// Where it is.
+        dir: PathBuf,
+    },
     /// What was stored cannot be read back whole.
     #[error(
         "the replay store {dir} is damaged: {what}. `getup replay repair {dir}` keeps every whole segment; or move \

@@ -112,6 +112,12 @@ impl Gate {
         Some(total)
     }
 
+    /// A sample that was counted is not handed out after all.
+    pub(crate) fn take_back(&self, batch: u64) {
+        self.lock().limiter.take_back(batch);
+        self.wake();
+    }
+
     /// Notes how many draws are left.
     pub(crate) fn set_available(&self, available: Option<u64>) {
         self.lock().limiter.set_available(available);
@@ -188,6 +194,12 @@ impl Gate {
 
     /// Waits for room for an insert, in a task that whoever shuts down drops; in turn with others.
     pub(crate) async fn admit_task(self: &Arc<Self>, env_steps: u64) -> Permit {
+        // Limp steps alone need no room.
+        if env_steps == 0
+            && let Some(permit) = self.try_admit(env_steps)
+        {
+            return permit;
+        }
         let mut wait = self.waits.waiting("writer");
         let turn = self.turn.lock();
         tokio::pin!(turn);

@@ -161,6 +161,11 @@ impl Limiter {
         self.wanted = 0;
     }
 
+    /// Counts them no more: they could not be.
+    pub(crate) fn take_back(&mut self, transitions: u64) {
+        self.samples -= transitions;
+    }
+
     /// The most transitions that one sample may ever have; a larger one could wait forever.
     pub(crate) fn largest_sample(&self) -> f64 {
         self.band.map_or(f64::INFINITY, |band| (band.max - band.min) / 2.0)

@@ -41,8 +41,7 @@ impl Log {
     /// Takes what must be of one moment. `dir` must not exist, and lie on the store's file system.
     pub(crate) fn begin_snapshot(&self, dir: &Path) -> Result<Snapshot, StoreError> {
         if dir.exists() {
-            let exists = io::Error::from(io::ErrorKind::AlreadyExists);
-            return Err(StoreError::io("create", dir)(exists));
+            return Err(StoreError::SnapshotExists { dir: dir.to_owned() });
         }
         let unfinished = Unfinished::create(dir)?;
         let full = self.files.len().saturating_sub(1);

@@ -15,10 +15,15 @@ use serde::Serialize;
 use std::fs::File;
 use std::path::Path;
 
+fn as_text<S: serde::Serializer>(number: &u64, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(number)
+}
+
 /// What a store's folder holds.
 #[derive(Clone, PartialEq, Debug, Serialize)]
 pub struct Survey {
-    /// Names the store.
+    /// Names the store; in JSON as text, for it has more digits than numbers there.
+    #[serde(serialize_with = "as_text")]
     pub store: u64,
     /// Of its transitions.
     pub spec: RunSpec,

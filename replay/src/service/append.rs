@@ -66,6 +66,9 @@ impl AppendStream {
         let end = {
             let reading = self.read(inbound, &taken, durable);
             tokio::pin!(reading);
+            // To be acknowledged. A client that does not read it must not hold up `reading`: that may have its turn at the
+            // limiter.
+            let mut newest = None;
             loop {
                 tokio::select! {
                     end = &mut reading => break end,
@@ -73,11 +76,9 @@ impl AppendStream {
                     // What waits for the limiter is not acknowledged: it comes again on another stream.
                     () = replies.closed() => return,
                     // With `reading`, a sender of it lives.
-                    Ok(()) = progress.changed() => {
-                        let sequence = *progress.borrow_and_update();
-                        if acknowledge(&replies, sequence).await.is_none() {
-                            return;
-                        }
+                    Ok(()) = progress.changed() => newest = Some(*progress.borrow_and_update()),
+                    Ok(place) = replies.reserve(), if newest.is_some() => {
+                        place.send(Ok(v1::AppendReply { durable_sequence: newest.take().unwrap_or_default() }));
                     }
                 }
             }

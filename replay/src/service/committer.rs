@@ -19,7 +19,7 @@ const MOST_BYTES: usize = 32 << 20;
 
 /// What a stream asks for.
 pub(super) enum Job {
-    /// Says how far the writer's segments are durable, after all that were queued before.
+    /// Says how far the writer's segments are durable. What it sends again of those that are queued is stored once.
     Introduce { writer: u64, name: String, introduced: oneshot::Sender<(Visit, u64)> },
     /// Appends a segment, and raises `durable` to its sequence number.
     Append { segment: Segment, permit: Permit, durable: watch::Sender<u64> },

@@ -80,8 +80,11 @@ impl Store {
             let followed = self.followed(&memory.ring, &drawn);
             (sampled, found, Vec::new(), followed, memory.state, memory.ring.len())
         };
-        // Before it is handed out; not under a lock that anybody else waits for, since the disk may take long.
-        self.watermark.raise_sampled(sampled)?;
+        // Before it is handed out; not under a lock that writers wait for, since the disk may take long.
+        if let Err(error) = self.watermark.raise_sampled(sampled) {
+            self.gate.take_back(options.batch as u64);
+            return Err(error);
+        }
         let counters = self.counters_of(state, sampled, held);
         self.metrics.sampled.inc_by(options.batch as u64);
         self.metrics.sample_seconds.observe(started.elapsed().as_secs_f64());

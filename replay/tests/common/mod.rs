@@ -36,13 +36,13 @@ pub fn open(dir: &Path, spec: &RunSpec, config: &ReplayConfig) -> Result<Store, 
     Store::open(dir, spec, config, ReplayMetrics::new(&registry), Waits::new(&registry))
 }
 
-/// Waits until `condition` holds.
 /// Says what is not checked, past the test harness, which keeps to itself what a test that passes prints.
 pub fn skip(what: impl std::fmt::Display) {
     use std::io::Write;
     let _ = writeln!(std::io::stderr(), "skipped: {what}");
 }
 
+/// Waits until `condition` holds.
 pub fn eventually(what: &str, mut condition: impl FnMut() -> bool) {
     let started = Instant::now();
     while !condition() {

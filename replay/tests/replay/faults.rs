@@ -258,3 +258,40 @@ fn a_writer_that_goes_while_the_limiter_holds_it_leaves_nothing_behind() {
     drop(writer);
     eventually("nobody waits", || replay.waiting().is_empty());
 }
+
+#[test]
+fn a_writer_that_reads_no_acknowledgement_holds_up_no_other() {
+    let paced =
+        ReplayConfig { min_size: 8, samples_per_insert: Some(1.0), error_buffer: Some(16.0), ..config() };
+    let replay = Replay::start(spec(8), &paced);
+    // Its window takes no acknowledgement, and a few wait for it at the service.
+    let endpoint = tonic::transport::Endpoint::from_shared(format!("http://{}", replay.endpoint)).unwrap();
+    let mut deaf = replay.runtime.block_on(async {
+        let channel = endpoint.initial_stream_window_size(0).connect().await.unwrap();
+        let (requests, outbound) = mpsc::channel(64);
+        let request = |message| v1::AppendRequest { message: Some(message), ..Default::default() };
+        requests.send(request(hello(&replay.spec, 1))).await.unwrap();
+        for sequence in 1..=40 {
+            let segment = common::message(&segment(&replay.spec, 1, sequence, 8));
+            requests.send(request(segment)).await.unwrap();
+        }
+        let mut client = v1::replay_client::ReplayClient::new(channel);
+        (client.append(ReceiverStream::new(outbound)).await.unwrap(), requests)
+    });
+    eventually("it waits for a sampler", || replay.waiting().contains("writer"));
+    let mut writer = replay.writer(2);
+    let mut source = replay.source(options(8), 1);
+    let heard = replay.runtime.spawn({
+        let segment = segment(&replay.spec, 2, 1, 8);
+        async move {
+            writer.send(&segment).await.unwrap();
+            writer.acknowledged(1).await.unwrap();
+        }
+    });
+    eventually("the other one is acknowledged", || {
+        source.poll(Duration::from_millis(50)).unwrap();
+        heard.is_finished()
+    });
+    replay.runtime.block_on(heard).unwrap();
+    deaf.0.get_mut();
+}

@@ -336,7 +336,7 @@ fn a_snapshot_and_its_original_go_their_own_ways_also_where_the_newest_file_was_
     store.append((1..=4).map(|i| segment(&spec(STEPS), 1, i, STEPS)).collect()).unwrap();
     store.snapshot(&copy).unwrap();
     let again = store.snapshot(&copy).unwrap_err().to_string();
-    assert!(again.contains("exists"), "{again}");
+    assert!(again.contains("there is a snapshot"), "{again}");
     drop(store);
     for sequence in 5..=9 {
         append(&copy, sequence);
