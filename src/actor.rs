@@ -53,8 +53,8 @@ async fn serve(config: &Config, role: &Role, diverged: PathBuf) -> Result<()> {
     };
     let writers = network.replays().iter().enumerate().map(writer).collect::<Result<Vec<_>, _>>()?;
     let link = GrpcLearner::new(at(&network.learner), setup.spec.clone(), &config.actor.name, waits.clone())?;
-    role.serve_metrics(&network.actor_metrics).await?;
-    let listener = role.bind_grpc(&network.actor).await?;
+    role.serve_metrics("network.actor_metrics", &network.actor_metrics).await?;
+    let listener = role.bind_grpc("network.actor", &network.actor).await?;
     tracing::info!(name = config.actor.name, health = %listener.local_addr()?, "actor started");
     let (port, routes) = (role.port(Limits::default()), Routes::new(health(role.shutdown.clone())));
     let server = tokio::spawn(port.serve(listener, routes, role.shutdown.clone()));

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Context, Result, ensure};
 use getup_policy::{MeanError, Policy};
 
-use crate::output::write_file;
+use crate::output::{check_place, is_same_file, say, write_file};
 
 /// What an evaluation said of one of them it did not say of their mean.
 const OF_ONE: &str = "evaluation_";
@@ -27,6 +27,7 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(arguments: Args) -> Result<()> {
+    check_place(&arguments.output)?;
     let load = |path: &PathBuf| Policy::load(path).with_context(|| path.display().to_string());
     let policies: Vec<Policy> = arguments.models.iter().map(load).collect::<Result<_>>()?;
     let first = &policies[0].metadata;
@@ -54,11 +55,9 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     mean.metadata.retain(|key, value| !key.starts_with(OF_ONE) && common(key, value));
     mean.metadata.insert("average_of".into(), policies.len().to_string());
     let shown = arguments.output.display();
-    ensure!(
-        !arguments.models.contains(&arguments.output),
-        "--output {shown} is one of the models: name another"
-    );
+    let is_output = |model: &PathBuf| is_same_file(model, &arguments.output);
+    ensure!(!arguments.models.iter().any(is_output), "--output {shown} is one of the models: name another");
     write_file(&arguments.output, mean.to_bytes())?;
-    println!("The mean of {} models is in {shown}. Try it: getup evaluate {shown}", policies.len());
+    say!("The mean of {} models is in {shown}. Try it: getup evaluate {shown}", policies.len());
     Ok(())
 }

@@ -23,7 +23,7 @@ use tokio::task::JoinSet;
 use tokio::time::{sleep_until, timeout};
 
 use crate::config::{ConfigArgs, reached_at};
-use crate::output::progress_bar;
+use crate::output::{progress_bar, say};
 use load::{episode, percentiles};
 
 /// Transitions of a minibatch.
@@ -145,7 +145,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     runtime.shutdown_background();
     let report = report?;
     if arguments.json {
-        println!("{}", serde_json::to_string(&report)?);
+        say!("{}", serde_json::to_string(&report)?);
     } else {
         report.print();
     }
@@ -154,7 +154,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
 
 impl Report {
     fn print(&self) {
-        let line = |what: String, value: f64, unit: &str| println!("{what:<36} {value:>12.1} {unit}");
+        let line = |what: String, value: f64, unit: &str| say!("{what:<36} {value:>12.1} {unit}");
         let by = format!("{} writer{}", self.writers, if self.writers == 1 { "" } else { "s" });
         line(format!("append p50, {by}"), self.append_p50_ms, "ms");
         line(format!("append p99, {by}"), self.append_p99_ms, "ms");
@@ -173,7 +173,7 @@ impl Report {
             line("broadcast lag p99".to_owned(), lag_p99_ms, "ms");
         }
         if let Some(why) = &self.no_broadcast {
-            println!("broadcasts were not measured: {why}");
+            say!("broadcasts were not measured: {why}");
         }
     }
 }

@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 use getup_transport::{Issued, generate_token, make_authority};
 
+use crate::output::say;
+
 /// Make an authority and a certificate that all roles of a cluster share, for mutual TLS.
 ///
 /// DIR gets ca.pem, ca.key, peer.pem and peer.key. Give the roles `security.ca=DIR/ca.pem`,
@@ -34,7 +36,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let vault = arguments.authority.as_ref().unwrap_or(dir);
     let issued = make_authority(dir, vault, &arguments.names, arguments.if_missing)?;
     let shown = dir.display();
-    println!(
+    say!(
         "{}",
         match issued {
             Issued::Nothing => format!("{shown}/peer.pem is valid: nothing to do"),
@@ -45,7 +47,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let token = dir.join("token");
     if arguments.token && !token.exists() {
         write_secret(dir, &token).with_context(|| format!("cannot write {}", token.display()))?;
-        println!("{} is new", token.display());
+        say!("{} is new", token.display());
     }
     Ok(())
 }

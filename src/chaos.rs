@@ -12,6 +12,8 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use crate::output::say;
+
 /// How often a cluster is asked how it is.
 const TICK: Duration = Duration::from_millis(500);
 /// Between the faults of a soak.
@@ -123,7 +125,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         bail!("--only: no fault of {shown} has such a name; there are: {}", names.join(", "));
     }
     if arguments.list {
-        faults.iter().for_each(|fault| println!("{}", fault.name));
+        faults.iter().for_each(|fault| say!("{}", fault.name));
         return Ok(());
     }
     ensure!(
@@ -141,7 +143,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         let outcome = plan.try_fault(fault);
         failed += usize::from(!outcome.passed && !outcome.skipped);
         if arguments.json {
-            println!("{}", serde_json::to_string(&outcome)?);
+            say!("{}", serde_json::to_string(&outcome)?);
         } else {
             let recovered = outcome.recovered_seconds;
             let recovered =
@@ -152,7 +154,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
                 Outcome { passed: true, .. } => "pass",
                 _ => "FAIL",
             };
-            println!("{verdict} {}{recovered}{problem}", fault.name);
+            say!("{verdict} {}{recovered}{problem}", fault.name);
         }
     }
     ensure!(failed == 0, "the cluster did not come through {failed} of its faults");

@@ -5,7 +5,7 @@ mod layers;
 
 use std::path::Path;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use documented::DocumentedFieldsOpt;
 use getup_actor::config::ActorConfig;
@@ -98,7 +98,19 @@ pub(crate) struct NetworkConfig {
 /// Where this machine reaches a service of this address: one that listens everywhere is here too, under the name that is in
 /// every certificate.
 pub(crate) fn reached_at(address: &str) -> String {
-    address.replace("0.0.0.0:", "localhost:").replace("[::]:", "localhost:")
+    let reached = |address: &str| match address.rsplit_once(':') {
+        Some(("0.0.0.0" | "[::]", port)) => format!("localhost:{port}"),
+        _ => address.to_owned(),
+    };
+    address.split(',').map(|address| reached(address.trim())).collect::<Vec<_>>().join(",")
+}
+
+/// Refuses what is no HOST:PORT, which would be found out by each role in its own way.
+fn check_address(key: &str, address: &str) -> Result<()> {
+    let parts = address.trim_end_matches('/').rsplit_once(':').filter(|(host, _)| !host.is_empty());
+    let is_address = parts.is_some_and(|(_, port)| port.parse::<u16>().is_ok());
+    ensure!(is_address, "network.{key} = {address:?}: HOST:PORT, such as replay:7401 or 127.0.0.1:9401");
+    Ok(())
 }
 
 impl NetworkConfig {
@@ -121,6 +133,16 @@ impl NetworkConfig {
                 "network.replay = {:?}: one address of each replay, such as replay-0:7401,replay-1:7401",
                 self.replay
             );
+            check_address("replay", address)?;
+        }
+        for (key, address) in [
+            ("learner", &self.learner),
+            ("actor", &self.actor),
+            ("replay_metrics", &self.replay_metrics),
+            ("learner_metrics", &self.learner_metrics),
+            ("actor_metrics", &self.actor_metrics),
+        ] {
+            check_address(key, address)?;
         }
         Ok(())
     }
@@ -175,7 +197,7 @@ pub(crate) struct ConfigArgs {
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<std::path::PathBuf>,
     /// One setting over everything else, such as `--set sac.batch=256`, or `--set traces.endpoint=http://HOST:4317` for
-    /// traces; may be repeated.
+    /// traces; may be repeated. `getup settings` lists them all; GETUP_SAC__BATCH=256 in the environment does the same.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
 }
@@ -192,7 +214,11 @@ impl ConfigArgs {
                 "--preset {asked}: the configuration was made from preset {made}; leave one out"
             );
         }
-        let from_environment = std::env::var(layers::PRESET_VARIABLE).ok();
+        let from_environment = match std::env::var(layers::PRESET_VARIABLE) {
+            Ok(preset) => Some(preset),
+            Err(std::env::VarError::NotPresent) => None,
+            Err(error) => bail!("{}: {error}", layers::PRESET_VARIABLE),
+        };
         let preset = self.preset.as_deref().or(from_file).or(from_environment.as_deref());
         layers.preset(preset.unwrap_or("laptop"))?;
         if let (Some(path), Some(table)) = (&self.config, file) {
@@ -222,6 +248,12 @@ impl Config {
         );
         self.task.validate()?;
         self.actor.validate()?;
+        self.sac.validate()?;
+        let exponent = self.replay.priority_exponent;
+        ensure!(
+            exponent.is_finite() && exponent >= 0.0,
+            "replay.priority_exponent = {exponent}: at least 0, and 0 for uniform draws"
+        );
         ensure!(
             self.sac.uniform_steps <= self.replay.capacity as u64,
             "sac.uniform_steps = {}: at most replay.capacity ({}), or they would never all be there",
@@ -232,13 +264,17 @@ impl Config {
         self.security.validate()?;
         self.traces.validate()?;
         self.replay_config(self.network.replays().len()).validate_for(&self.run_spec()?)?;
-        self.sac.validate()?;
         self.curriculum.validate()?;
         self.evaluation.validate()?;
         self.learner.validate()?;
         ensure!(
             !self.run.is_empty() && self.run.len() <= 128,
             "run = {:?}: a run's name has 1 to 128 bytes",
+            self.run
+        );
+        ensure!(
+            !self.run.contains('/') && self.run != "." && self.run != "..",
+            "run = {:?}: a name without a `/`; --run says where its folder is",
             self.run
         );
         Ok(())

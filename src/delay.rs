@@ -12,6 +12,8 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep, sleep_until};
 
+use crate::output::say;
+
 /// Bytes that are passed on at a time, at most.
 const CHUNK: usize = 16 << 10;
 /// So many chunks are on their way in one direction of a connection, at most: 16 MiB.
@@ -49,7 +51,7 @@ pub(crate) async fn run(arguments: Args) -> Result<()> {
             route.split_once('=').with_context(|| format!("{route} is not LISTEN=TARGET"))?;
         let listener =
             TcpListener::bind(listen).await.with_context(|| format!("cannot listen at {listen}"))?;
-        println!("{} is {target}, {} s later", listener.local_addr()?, by.as_secs_f64());
+        say!("{} is {target}, {} s later", listener.local_addr()?, by.as_secs_f64());
         routes.push(serve(listener, target, Slowness { by, back: arguments.back }));
     }
     try_join_all(routes).await.map(drop)
@@ -62,7 +64,7 @@ async fn serve(listener: TcpListener, target: &str, slowness: Slowness) -> Resul
         tokio::spawn(async move {
             let ended = pass_on(client, &target, slowness).await;
             let how = ended.map_or_else(|error| error.to_string(), |()| "both sides ended it".to_owned());
-            println!("{address} to {target}: {how}");
+            say!("{address} to {target}: {how}");
         });
     }
 }

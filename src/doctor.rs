@@ -9,6 +9,7 @@ use getup_sim::{GetUp, Task};
 use serde::Serialize;
 
 use crate::config::{Config, ConfigArgs};
+use crate::output::say;
 
 /// Seconds from 1970 to 2024: a clock before that was never set.
 const CLOCK_IS_SET: u64 = 1_704_067_200;
@@ -58,10 +59,10 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     add("disk", disk(&arguments.run));
     add("clock", clock());
     if arguments.json {
-        println!("{}", serde_json::to_string(&checks).context("checks are not expressible as JSON")?);
+        say!("{}", serde_json::to_string(&checks).context("checks are not expressible as JSON")?);
     } else {
         for check in &checks {
-            println!("{} {:14} {}", if check.good { "ok  " } else { "FAIL" }, check.name, check.finding);
+            say!("{} {:14} {}", if check.good { "ok  " } else { "FAIL" }, check.name, check.finding);
         }
     }
     let failed = checks.iter().filter(|check| !check.good).count();

@@ -9,7 +9,7 @@ use getup_policy::Policy;
 use getup_sim::{Character, TaskConfig};
 use serde::Serialize;
 
-use crate::output::{progress_bar, write_file};
+use crate::output::{check_place, progress_bar, say, write_file};
 
 /// Lanes that are evaluated together.
 const LANES: usize = 16;
@@ -27,11 +27,11 @@ pub(crate) struct Args {
     /// Falls to evaluate.
     #[arg(long, default_value_t = 100)]
     episodes: usize,
-    /// Seed of the falls.
-    #[arg(long, default_value_t = 0)]
+    /// Seed of the falls, under 2^32.
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..1 << 32))]
     seed: u64,
-    /// Torque-limit multiplier. [default: the model's own]
-    #[arg(long)]
+    /// Torque-limit multiplier, over 0 and at most 4. [default: the model's own]
+    #[arg(long, allow_negative_numbers = true)]
     beta: Option<f64>,
     /// standard, cast or one_arm. [default: the model's own]
     #[arg(long)]
@@ -67,6 +67,9 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         "--episodes {}: from 1 to 1000000",
         arguments.episodes
     );
+    if let Some(path) = &arguments.record {
+        check_place(path)?;
+    }
     let Actor { policy, beta, task } = Actor::load(&arguments.model, arguments.beta, arguments.character)?;
     let mut evaluator = Evaluator::new(&task, beta.max(1.0), LANES.min(arguments.episodes))?;
     let seeds = unseen_falls(arguments.seed, arguments.episodes);
@@ -75,22 +78,22 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         bar.set_position(done as u64);
         ControlFlow::Continue(())
     };
-    let episodes = match &arguments.record {
+    let (episodes, recorded) = match &arguments.record {
         Some(path) => {
             let (episodes, file) = evaluator.record(&policy, beta, &seeds, progress)?;
-            write_file(path, file.to_json())?;
-            episodes
+            (episodes, Some((path, file)))
         }
-        None => evaluator.evaluate(&policy, beta, &seeds, progress)?,
+        None => (evaluator.evaluate(&policy, beta, &seeds, progress)?, None),
     };
     bar.finish_and_clear();
     let report = summarize(&episodes, beta, task.character, arguments.seed);
     if arguments.json {
-        println!("{}", serde_json::to_string(&report).context("the report is not expressible as JSON")?);
+        say!("{}", serde_json::to_string(&report).context("the report is not expressible as JSON")?);
     } else {
         print_report(&report);
     }
-    if let Some(path) = &arguments.record {
+    if let Some((path, file)) = recorded {
+        write_file(path, file.to_json())?;
         eprintln!("Episodes written to {}", path.display());
         let failed = episodes.iter().filter(|episode| episode.head_heights.is_empty()).count();
         if failed > 0 {
@@ -99,6 +102,17 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     }
     Ok(())
 }
+
+/// What to name in the place of a run's folder.
+pub(crate) fn in_run_folder(folder: &Path) -> String {
+    match folder.join("models/best.safetensors") {
+        best if best.exists() => format!("name a file in it, such as {}", best.display()),
+        _ => "name a file".to_owned(),
+    }
+}
+
+/// The most that β may be, in training (`curriculum.beta_start`) and here.
+const MOST_BETA: f64 = 4.0;
 
 /// A model with what it is asked to act under: its own character and β, unless others are given, and its own physics rate.
 pub(crate) struct Actor {
@@ -109,10 +123,13 @@ pub(crate) struct Actor {
 
 impl Actor {
     pub(crate) fn load(model: &Path, beta: Option<f64>, character: Option<Character>) -> Result<Self> {
-        let policy = Policy::load(model).with_context(|| model.display().to_string())?;
+        let shown = model.display();
+        ensure!(!model.is_dir(), "{shown} is a folder: {}", in_run_folder(model));
+        let policy = Policy::load(model).with_context(|| shown.to_string())?;
         let Some(beta) = beta.or_else(|| policy.number("beta")) else {
             bail!("the model names no beta: give one with --beta");
         };
+        ensure!(beta > 0.0 && beta <= MOST_BETA, "--beta {beta}: over 0 and at most {MOST_BETA}");
         let character = match (character, policy.metadata.get("character")) {
             (Some(character), _) => character,
             (None, Some(name)) => name.parse().with_context(|| "the model's metadata")?,
@@ -160,14 +177,14 @@ fn print_report(report: &Report) {
     let percent = |rate: f64, [low, high]: [f64; 2]| {
         format!("{:5.1} %  (95 %: {:.1} to {:.1})", 100.0 * rate, 100.0 * low, 100.0 * high)
     };
-    println!("{} falls of the {} character, β = {}", report.episodes, report.character, report.beta);
-    println!("  rise          {}", percent(report.rise_rate, report.rise_rate_interval));
-    println!("  stand         {}", percent(report.stand_rate, report.stand_rate_interval));
-    println!("  return        mean {:.2}, minimum {:.2}", report.mean_return, report.min_return);
+    say!("{} falls of the {} character, β = {}", report.episodes, report.character, report.beta);
+    say!("  rise          {}", percent(report.rise_rate, report.rise_rate_interval));
+    say!("  stand         {}", percent(report.stand_rate, report.stand_rate_interval));
+    say!("  return        mean {:.2}, minimum {:.2}", report.mean_return, report.min_return);
     let (highest, last) = (report.mean_max_head_height, report.mean_final_head_height);
-    println!("  head height   highest {highest:.2} m, at the end {last:.2} m (means)");
+    say!("  head height   highest {highest:.2} m, at the end {last:.2} m (means)");
     if report.diverged > 0 {
-        println!("  diverged      {} simulations", report.diverged);
+        say!("  diverged      {} simulations", report.diverged);
     }
 }
 

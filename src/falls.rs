@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use getup_sim::{Character, TaskConfig, falls};
 
-use crate::output::write_file;
+use crate::output::{check_place, write_file};
 
 /// Write the states in which falls begin and end, as JSON.
 ///
@@ -30,6 +30,9 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(arguments: Args) -> Result<()> {
+    let count = arguments.count;
+    ensure!((1..=1_000_000).contains(&count), "--count {count}: from 1 to 1000000");
+    check_place(&arguments.output)?;
     let config = TaskConfig { character: arguments.character, ..TaskConfig::default() };
     let falls = falls::draw(&config, arguments.count, arguments.seed)?;
     let text = serde_json::to_string(&falls).context("falls are not expressible as JSON")?;

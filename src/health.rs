@@ -8,6 +8,7 @@ use anyhow::{Context, Result, anyhow, bail, ensure};
 use clap::ValueEnum;
 
 use crate::config::{ConfigArgs, reached_at};
+use crate::output::say;
 
 const PATIENCE: Duration = Duration::from_secs(3);
 
@@ -46,7 +47,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     if head.split(' ').nth(1) != Some("200") {
         bail!("the {name} is there and does not work yet or any more: {}", body.trim());
     }
-    println!("{}", body.trim());
+    say!("{}", body.trim());
     Ok(())
 }
 

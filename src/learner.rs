@@ -20,9 +20,10 @@ use crate::run::{check_run, load_beginning, make_hub, make_trainer, note_config,
 /// Minibatches that are on their way while one is trained on.
 const PREFETCH: usize = 8;
 
-/// Run the learner: trains on the replay's minibatches, broadcasts policies, leases evaluations, advances the
-/// curriculum. It resumes the run it finds in its folder; when the curriculum has ended it goes on serving the final
-/// policy until SIGTERM.
+/// Run the learner: trains on the replay's minibatches, broadcasts policies, leases evaluations, advances the curriculum.
+///
+/// It resumes the run it finds in its folder; when the curriculum has ended it goes on serving the final policy until
+/// SIGTERM.
 #[derive(clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
@@ -52,15 +53,16 @@ async fn serve(
     from: Option<&Path>,
 ) -> Result<()> {
     check_run(config, &folder)?;
-    let beginning = from.filter(|_| !folder.has_checkpoint()).map(load_beginning).transpose()?;
+    let beginning = from.filter(|_| !folder.has_checkpoint());
+    let beginning = beginning.map(|path| load_beginning(config, path)).transpose()?;
     let start = beginning.as_ref().map_or(Start::Newest, Start::From);
     folder.create()?;
     let _lock = folder.lock()?;
     let (hub, incarnation) = make_hub(config, role, &folder)?;
     // Before all that takes long, so that whoever probes sees that it starts.
-    role.serve_metrics(&config.network.learner_metrics).await?;
+    role.serve_metrics("network.learner_metrics", &config.network.learner_metrics).await?;
     let address = &config.network.learner;
-    let listener = role.bind_grpc(address).await?;
+    let listener = role.bind_grpc("network.learner", address).await?;
     tracing::info!("learner serves gRPC at {}", listener.local_addr()?);
     let mut trainer =
         make_trainer(config, role, folder.clone(), Arc::clone(&hub), incarnation, device, start)?;

@@ -9,7 +9,7 @@ use getup_sim::picture::Painter;
 use getup_sim::{Character, UP_HEIGHT};
 
 use crate::evaluate::{Actor, unseen_falls};
-use crate::output::write_file;
+use crate::output::{check_place, say, write_file};
 
 /// Control steps a second.
 const HZ: f64 = 40.0;
@@ -30,8 +30,8 @@ pub(crate) struct Args {
     /// The picture to write, a PNG.
     #[arg(long, value_name = "FILE", default_value = "strip.png")]
     output: PathBuf,
-    /// Seed of the fall.
-    #[arg(long, default_value_t = 0)]
+    /// Seed of the fall, under 2^32.
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..1 << 32))]
     seed: u64,
     /// Frames of the strip.
     #[arg(long, default_value_t = 9)]
@@ -42,8 +42,8 @@ pub(crate) struct Args {
     /// Height of the strip in pixels, from 16 to 1080; a frame is three quarters as wide.
     #[arg(long, default_value_t = 320)]
     height: usize,
-    /// Torque-limit multiplier. [default: the model's own]
-    #[arg(long)]
+    /// Torque-limit multiplier, over 0 and at most 4. [default: the model's own]
+    #[arg(long, allow_negative_numbers = true)]
     beta: Option<f64>,
     /// standard, cast or one_arm. [default: the model's own]
     #[arg(long)]
@@ -54,6 +54,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let Args { frames, height, .. } = arguments;
     ensure!((1..=100).contains(&frames), "--frames {frames}: from 1 to 100");
     ensure!((16..=1080).contains(&height), "--height {height}: from 16 to 1080");
+    check_place(&arguments.output)?;
     let actor = Actor::load(&arguments.model, arguments.beta, arguments.character)?;
     let (episode, poses) = play(&actor, arguments.seed)?;
     let last = last_step(&episode, arguments.seconds, poses.len())?;
@@ -76,7 +77,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         (true, false) => "it rises",
         (false, false) => "it does not rise",
     };
-    println!(
+    say!(
         "{}: seconds {} of fall {}, β = {}; {verdict}, return {:.1}",
         arguments.output.display(),
         seconds.join(", "),

@@ -106,8 +106,8 @@ impl Role {
     }
 
     /// Binds a gRPC port, which others than this machine reach only where they show something or are meant to.
-    pub(crate) async fn bind_grpc(&self, address: &str) -> Result<TcpListener> {
-        let listener = bind(address, "gRPC").await?;
+    pub(crate) async fn bind_grpc(&self, setting: &str, address: &str) -> Result<TcpListener> {
+        let listener = bind(setting, address).await?;
         require_protection(listener.local_addr()?, &self.security)?;
         Ok(listener)
     }
@@ -120,8 +120,8 @@ impl Role {
     }
 
     /// Serves `/metrics` at `address` until shutdown; returns where.
-    pub(crate) async fn serve_metrics(&self, address: &str) -> Result<SocketAddr> {
-        let listener = bind(address, "metrics").await?;
+    pub(crate) async fn serve_metrics(&self, setting: &str, address: &str) -> Result<SocketAddr> {
+        let listener = bind(setting, address).await?;
         let bound = listener.local_addr()?;
         tracing::info!("metrics at http://{bound}/metrics");
         let credentials = self.credentials.clone();
@@ -140,11 +140,11 @@ impl Role {
     }
 }
 
-/// Binds a listener, or says which address could not be had and what to do.
-pub(crate) async fn bind(address: &str, what: &str) -> Result<TcpListener> {
+/// Binds a listener at the address of a setting, or says which could not be had and what to do.
+async fn bind(setting: &str, address: &str) -> Result<TcpListener> {
     TcpListener::bind(address).await.with_context(|| {
         format!(
-            "cannot listen at {address} for {what}: choose another address with --set network.…=HOST:PORT"
+            "cannot listen at {setting} = {address}: choose another address with --set {setting}=HOST:PORT"
         )
     })
 }

@@ -2,11 +2,11 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use getup_sim::Character;
 use getup_sim::rollout::{RolloutFile, replay};
 
-use crate::output::write_file;
+use crate::output::{check_place, is_same_file, write_file};
 
 /// Replay recorded states and actions, and write what the simulation makes of them.
 ///
@@ -26,7 +26,9 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(arguments: Args) -> Result<()> {
-    let input = &arguments.input;
+    let (input, output) = (&arguments.input, &arguments.output);
+    check_place(output)?;
+    ensure!(!is_same_file(input, output), "--output {} is the input: name another", output.display());
     let text = std::fs::read_to_string(input).with_context(|| format!("cannot read {}", input.display()))?;
     let played = RolloutFile::parse(&text)
         .and_then(|file| replay(&file, arguments.character))

@@ -19,6 +19,7 @@ use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::config::Config;
+use crate::evaluate::in_run_folder;
 use crate::role::Role;
 
 /// A run goes on under the preset and the seed that it began with, whatever layer they come from now.
@@ -43,9 +44,23 @@ pub(crate) fn check_run(config: &Config, folder: &RunFolder) -> Result<()> {
     Ok(())
 }
 
-/// Refuses what no run can begin with before anything is made for the run.
-pub(crate) fn load_beginning(path: &Path) -> Result<Beginning> {
-    Beginning::load(path).context("--from")
+/// Refuses what this run cannot begin with before anything is made for it.
+pub(crate) fn load_beginning(config: &Config, path: &Path) -> Result<Beginning> {
+    ensure!(!path.is_dir(), "--from {}: is a folder: {}", path.display(), in_run_folder(path));
+    let load = || -> Result<Beginning> {
+        let beginning = Beginning::load(path)?;
+        beginning.check(&task_shape(config)?, &config.sac)?;
+        Ok(beginning)
+    };
+    load().context("--from")
+}
+
+/// What SAC must know of this run's task.
+fn task_shape(config: &Config) -> Result<TaskShape> {
+    let task = GetUp::new(&config.task, config.control_limit())?;
+    let observation = task.observation_width();
+    // β̂ is the last number of an observation.
+    Ok(TaskShape { observation, action: task.action_width(), unnormalized: vec![observation - 1] })
 }
 
 /// The meeting place of this learner and its actors, and the number of this start of a learner on the run.
@@ -75,8 +90,6 @@ pub(crate) fn make_trainer(
     device: Device,
     start: Start<'_>,
 ) -> Result<Trainer> {
-    let task = GetUp::new(&config.task, config.control_limit())?;
-    let observation = task.observation_width();
     // A ring removes whole segments: it is never full to the last transition.
     let refill_steps = config.sac.refill_steps.min(config.replay.capacity as u64 / 2);
     let trainer = TrainerConfig {
@@ -86,8 +99,7 @@ pub(crate) fn make_trainer(
         seed: config.seed,
         replays: config.network.replays().len(),
         steps: (config.steps > 0).then_some(config.steps),
-        // β̂ is the last number of an observation.
-        shape: TaskShape { observation, action: task.action_width(), unnormalized: vec![observation - 1] },
+        shape: task_shape(config)?,
         sac: SacConfig { refill_steps, ..config.sac.clone() },
         curriculum: config.curriculum.clone(),
         evaluation: config.evaluation.clone(),

@@ -3,6 +3,7 @@
 use anyhow::{Result, ensure};
 
 use crate::config::{ConfigArgs, Setting, explained};
+use crate::output::say;
 
 /// Print every setting, its value and what it means, as a file for `--config`.
 ///
@@ -28,6 +29,6 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         "no setting's name contains {}: `getup settings` alone lists all",
         arguments.words.join(" or ")
     );
-    print!("{}", explained(shown).trim_start_matches('\n'));
+    say!("{}", explained(shown).trim());
     Ok(())
 }

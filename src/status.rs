@@ -11,6 +11,7 @@ use serde_json::json;
 use tonic::Status;
 
 use crate::config::{ConfigArgs, reached_at};
+use crate::output::say;
 
 const TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -42,17 +43,17 @@ pub(crate) async fn run(arguments: Args) -> Result<()> {
         };
         let learner =
             learner.as_ref().map_or_else(|error| json!({"error": format!("{error:#}")}), learner_json);
-        println!("{}", json!({"replay": replay, "learner": learner}));
+        say!("{}", json!({"replay": replay, "learner": learner}));
     } else {
         for replay in &replays {
             match replay {
                 Ok(reply) => print_replay(reply),
-                Err(error) => println!("replay   not reached: {error:#}"),
+                Err(error) => say!("replay   not reached: {error:#}"),
             }
         }
         match &learner {
             Ok(reply) => print_learner(reply),
-            Err(error) => println!("learner  not reached: {error:#}"),
+            Err(error) => say!("learner  not reached: {error:#}"),
         }
     }
     anyhow::ensure!(
@@ -89,21 +90,27 @@ fn or_nobody(waiting: &str) -> &str {
 fn print_replay(reply: &v1::DescribeReply) {
     let counters = reply.counters.unwrap_or_default();
     let limiter = reply.limiter.clone().unwrap_or_default();
-    println!(
+    say!(
         "replay   {} of {} transitions, {} env steps in {} episodes, {} sampled",
-        reply.size, reply.capacity, counters.env_steps, counters.episodes, counters.sampled
+        reply.size,
+        reply.capacity,
+        counters.env_steps,
+        counters.episodes,
+        counters.sampled
     );
-    println!("         {}", or_nobody(&limiter.waiting));
+    say!("         {}", or_nobody(&limiter.waiting));
     for writer in &reply.writers {
-        println!(
+        say!(
             "         writer {}: {} segments, silent for {:.0} s",
-            writer.name, writer.durable_sequence, writer.silent_seconds
+            writer.name,
+            writer.durable_sequence,
+            writer.silent_seconds
         );
     }
 }
 
 fn print_learner(reply: &v1::StatusReply) {
-    println!(
+    say!(
         "learner  {}: run {}, {} env steps, {} updates ({:.0}/s), stage {}, β = {:.3}",
         reply.state,
         reply.run,
@@ -113,18 +120,18 @@ fn print_learner(reply: &v1::StatusReply) {
         reply.stage,
         reply.beta
     );
-    println!("         {}", or_nobody(&reply.waiting));
+    say!("         {}", or_nobody(&reply.waiting));
     if let Some(evaluation) = &reply.evaluation {
         let v1::EvaluationSummary { env_steps, mean, min, .. } = evaluation;
         let [rises, stands] = [evaluation.rises, evaluation.stands].map(|share| 100.0 * share);
-        println!(
+        say!(
             "         last evaluation at {env_steps} env steps: mean return {mean:.1}, minimum {min:.1}, rises \
              {rises:.0} %, stands {stands:.0} %"
         );
     }
     for actor in &reply.actors {
         let activity = if actor.waiting.is_empty() { "steps" } else { actor.waiting.as_str() };
-        println!(
+        say!(
             "actor    {}: {activity}; {} env steps, policy {}, silent for {:.0} s{}",
             actor.name,
             actor.env_steps,

@@ -17,6 +17,7 @@ use getup_replay::{LocalSource, ReplayMetrics, Store};
 
 use crate::config::{Config, ConfigArgs};
 use crate::links::{HubLink, StoreWriter};
+use crate::output::say;
 use crate::role::{LogFormat, Role};
 use crate::run::{check_run, load_beginning, make_hub, make_trainer, note_config, sample_options};
 
@@ -38,7 +39,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE", conflicts_with = "resume")]
     from: Option<PathBuf>,
     /// Every random draw comes from it. [default: 0]
-    #[arg(long)]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     seed: Option<u64>,
     /// Env steps of the whole run; looked at once updates begin, after the uniform ones. [default: until the
     /// curriculum ends]
@@ -58,7 +59,7 @@ pub(crate) struct Args {
 
 pub(crate) fn run(mut arguments: Args) -> Result<()> {
     let (config, folder) = prepare(&mut arguments)?;
-    let beginning = arguments.from.as_deref().map(load_beginning).transpose()?;
+    let beginning = arguments.from.as_deref().map(|path| load_beginning(&config, path)).transpose()?;
     let start = match (&beginning, arguments.resume) {
         (Some(beginning), _) => Start::From(beginning),
         (None, true) => Start::Newest,
@@ -201,9 +202,9 @@ fn open_store(config: &Config, role: &Role, folder: &RunFolder) -> Result<Arc<St
 /// Serves `/metrics`; where its port is taken, by another run on this machine, at any other.
 async fn serve_metrics(config: &Config, role: &Role) -> Result<()> {
     let address = &config.network.learner_metrics;
-    if role.serve_metrics(address).await.is_err() {
-        tracing::warn!("{address} is taken: another port serves this run's metrics");
-        role.serve_metrics("127.0.0.1:0").await?;
+    if let Err(error) = role.serve_metrics("network.learner_metrics", address).await {
+        tracing::warn!("another port serves this run's metrics: {error:#}");
+        role.serve_metrics("network.learner_metrics", "127.0.0.1:0").await?;
     }
     Ok(())
 }
@@ -213,26 +214,26 @@ fn conclude(ending: Ending, folder: &RunFolder) {
     let shown = folder.root().display();
     match ending {
         Ending::Curriculum(Outcome::FloorPassed { beta }) => {
-            println!("Done: the curriculum went all the way, the weakest stage passed has β = {beta:.3}.");
+            say!("Done: the curriculum went all the way, the weakest stage passed has β = {beta:.3}.");
         }
         Ending::Curriculum(Outcome::StageOutlasted { beta }) => {
-            println!("Done: the curriculum is over, the weakest stage passed has β = {beta:.3}.");
+            say!("Done: the curriculum is over, the weakest stage passed has β = {beta:.3}.");
         }
         Ending::Curriculum(Outcome::Settled { beta }) => {
-            println!("Done: at β = {beta:.3} no evaluation was better than the best for long.");
+            say!("Done: at β = {beta:.3} no evaluation was better than the best for long.");
         }
-        Ending::Steps(steps) => println!("Done: {steps} env steps{}.", last_evaluation(folder)),
+        Ending::Steps(steps) => say!("Done: {steps} env steps{}.", last_evaluation(folder)),
         Ending::Shutdown => {
-            println!("Saved. Go on with: {} train --resume --run {shown}", program());
+            say!("Saved. Go on with: {} train --resume --run {shown}", program());
             return;
         }
     }
     let model = if folder.model("best").exists() { "best" } else { "last" };
-    println!("Evaluations: {}", folder.evaluations().display());
-    println!("Try it on unseen falls: {} evaluate {}", program(), folder.model(model).display());
+    say!("Evaluations: {}", folder.evaluations().display());
+    say!("Try it on unseen falls: {} evaluate {}", program(), folder.model(model).display());
     if let Ending::Steps(steps) = ending {
         let more = steps.saturating_mul(2);
-        println!("Train it further: {} train --resume --run {shown} --steps {more}", program());
+        say!("Train it further: {} train --resume --run {shown} --steps {more}", program());
     }
 }
 

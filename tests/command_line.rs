@@ -5,7 +5,7 @@
 mod common;
 
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use common::{Process, fail, free_address, getup, succeed, wait_for};
@@ -131,7 +131,7 @@ fn a_run_goes_on_without_its_replay_and_another_begins_with_its_networks() {
 
     for (file, expected) in [
         (checkpoint.to_str().unwrap(), "the configured networks have"),
-        ("first/models/last.safetensors", "hidden: [8, 8] } }: take another model, or set [sac]"),
+        ("first/models/last.safetensors", "hidden layers of [8, 8]: take another model, or set [sac]"),
         ("first/config.toml", "the checkpoint first/config.toml is not usable"),
     ] {
         let from = ["--run", "third", "--from", file];
@@ -371,4 +371,94 @@ fn a_fault_is_healed_after_half_an_injection_and_after_an_interruption() {
 
     let refused = fail(&mut plan(folder.path(), "inject = 'true'\nhold = -1.0"));
     assert!(refused.contains("hold = -1"), "{refused}");
+}
+
+#[test]
+fn what_cannot_be_written_or_played_is_refused_before_the_work() {
+    let folder = tempfile::tempdir().unwrap();
+    let strong = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/strong.safetensors");
+    for name in ["a", "b"] {
+        std::fs::copy(&strong, folder.path().join(name)).unwrap();
+    }
+    std::fs::create_dir_all(folder.path().join("run/models")).unwrap();
+    std::fs::copy(&strong, folder.path().join("run/models/best.safetensors")).unwrap();
+    for (arguments, expected) in [
+        (&["average", "a", "b", "--output", "./a"][..], "./a is one of the models"),
+        (&["average", "a", "b", "--output", "no/c"], "no/c: there is no folder no"),
+        (&["evaluate", "a", "--record", "no/c"], "no/c: there is no folder no"),
+        (&["evaluate", "a", "--beta", "1e300"], "over 0 and at most 4"),
+        (&["evaluate", "a", "--beta", "-1"], "--beta -1: over 0"),
+        (&["evaluate", "a", "--seed", "4294967296"], "4294967296"),
+        (&["evaluate", "run"], "run is a folder: name a file in it, such as run/models/best.safetensors"),
+        (&["falls", "--output", "f", "--count", "18446744073709551615"], "from 1 to 1000000"),
+        (&["falls", "--output", "f", "--count", "0"], "from 1 to 1000000"),
+        (&["rollout", "--input", "a", "--output", "./a"], "./a is the input"),
+        (&["settings", "--set", "network.replay=nope"], "network.replay = \"nope\": HOST:PORT"),
+        (&["settings", "--set", "network.learner=h:99999"], "network.learner = \"h:99999\": HOST:PORT"),
+        (&["settings", "--set", "run=../up"], "a name without a `/`"),
+        (&["settings", "--set", "sac.batch=0"], "sac.batch = 0"),
+        (&["settings", "--set", "replay.priority_exponent=-1"], "replay.priority_exponent = -1"),
+        (&["train", "--run", "r", "--from", "run"], "--from run: is a folder"),
+        (
+            &["train", "--run", "r", "--from", "a", "--set", "task.character=cast"],
+            "68 numbers in, 21 motors, SimBa of width 128",
+        ),
+    ] {
+        let error = fail(getup(arguments).current_dir(folder.path()));
+        assert!(error.contains(expected) && !error.contains("panicked"), "{arguments:?} said:\n{error}");
+    }
+    assert_eq!(
+        std::fs::read_dir(folder.path()).unwrap().count(),
+        3,
+        "a refused command leaves nothing behind"
+    );
+}
+
+#[test]
+fn a_command_that_prints_ends_with_its_reader() {
+    let mut command = getup(&["settings"]);
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(String::from_utf8_lossy(&output.stderr), "");
+}
+
+/// Words of these letters in a text.
+fn words<'a>(text: &'a str, letters: impl Fn(char) -> bool + 'a) -> impl Iterator<Item = &'a str> + 'a {
+    text.split(move |letter| !letters(letter)).filter(|word| !word.is_empty())
+}
+
+#[test]
+fn every_setting_and_metric_that_a_document_names_exists() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let settings: toml::Table = succeed(&mut getup(&["settings"])).parse().unwrap();
+    let metrics = std::fs::read_to_string(root.join("docs/metrics.md")).unwrap();
+    let mut documents = vec![root.join("README.md"), root.join("SECURITY.md"), root.join("models/README.md")];
+    documents.extend(std::fs::read_dir(root.join("docs")).unwrap().map(|entry| entry.unwrap().path()));
+    documents.retain(|path| path.extension().is_some_and(|extension| extension == "md"));
+    let (mut named, mut unknown) = (0, Vec::new());
+    for path in documents {
+        let text = std::fs::read_to_string(&path).unwrap();
+        for word in words(&text, |letter| letter.is_ascii_lowercase() || letter == '_') {
+            if word.starts_with("getup_") && !metrics.contains(word) {
+                unknown.push(format!("{}: {word}", path.display()));
+            }
+        }
+        // In code, where what is no setting has no dot after a table's name.
+        for code in
+            text.split('`').skip(1).step_by(2).chain(text.lines().filter(|line| line.contains("--set ")))
+        {
+            for word in words(code, |letter| letter.is_ascii_lowercase() || "._/".contains(letter)) {
+                let Some((table, key)) = word.split_once('.').filter(|(_, key)| !key.is_empty()) else {
+                    continue;
+                };
+                let Some(table) = settings.get(table).and_then(toml::Value::as_table) else { continue };
+                named += 1;
+                if !table.contains_key(key.split('.').next().unwrap()) {
+                    unknown.push(format!("{}: {word}", path.display()));
+                }
+            }
+        }
+    }
+    assert!(named > 50 && unknown.is_empty(), "{named} settings are named, these do not exist: {unknown:#?}");
 }

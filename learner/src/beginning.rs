@@ -3,9 +3,11 @@
 use std::path::Path;
 
 use getup_policy::{ModelError, Policy};
+use tch::Device;
 
 use crate::checkpoint::{Checkpoint, CheckpointError};
-use crate::sac::Sac;
+use crate::config::SacConfig;
+use crate::sac::{Sac, TaskShape};
 
 /// A trained actor, and what else its file holds.
 #[derive(Clone, Debug)]
@@ -28,6 +30,14 @@ impl Beginning {
                 Ok(Self::Checkpoint(Box::new(Checkpoint::load(path)?)))
             }
         }
+    }
+
+    /// Refuses what does not fit a run of this configuration.
+    ///
+    /// # Errors
+    /// As a run that begins with it.
+    pub fn check(&self, shape: &TaskShape, config: &SacConfig) -> Result<(), CheckpointError> {
+        self.begin(&mut Sac::new(shape, config, 0, Device::Cpu, 1))
     }
 
     /// Puts it into the untrained `sac`, whose configuration decides what fits.

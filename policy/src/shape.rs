@@ -2,6 +2,8 @@
 //!
 //! The learner's network and the actor's forward pass are both built from [`PolicyShape::tensors`].
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 /// The log standard deviation is squashed by a tanh into this range (App. D).
@@ -40,6 +42,17 @@ pub struct PolicyShape {
     pub action: usize,
     /// The layers between.
     pub body: Body,
+}
+
+impl fmt::Display for PolicyShape {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { observation, action, body } = self;
+        write!(formatter, "{observation} numbers in, {action} motors, ")?;
+        match body {
+            Body::Mlp { hidden } => write!(formatter, "hidden layers of {hidden:?}"),
+            Body::Simba { width, blocks } => write!(formatter, "SimBa of width {width}, {blocks} blocks"),
+        }
+    }
 }
 
 impl Body {

@@ -84,9 +84,10 @@ async fn start(
     dir: PathBuf,
     tables: Option<PathBuf>,
 ) -> Result<()> {
-    let listener = role.bind_grpc(&shard.address).await?;
-    role.serve_metrics(&config.network.replay_metrics).await?;
-    std::fs::create_dir_all(&dir)?;
+    let listener = role.bind_grpc("network.replay", &shard.address).await?;
+    role.serve_metrics("network.replay_metrics", &config.network.replay_metrics).await?;
+    std::fs::create_dir_all(&dir)
+        .with_context(|| format!("cannot make the store's folder {}: choose another --dir", dir.display()))?;
     let (spec, settings) = (config.run_spec()?, config.replay_config(shard.of));
     let metrics = ReplayMetrics::new(&role.registry);
     tracing::info!("replay will serve gRPC at {}, its store is {}", listener.local_addr()?, dir.display());

@@ -9,7 +9,7 @@ use getup_transport::{Credentials, Endpoint};
 use serde_json::json;
 
 use crate::config::{ConfigArgs, reached_at};
-use crate::output::progress_bar;
+use crate::output::{progress_bar, say};
 
 /// A tool and its arguments.
 #[derive(Subcommand)]
@@ -129,66 +129,69 @@ fn survey(dir: &Path) -> Result<Survey> {
 
 fn print_survey(survey: &Survey, json: bool) -> Result<()> {
     if json {
-        println!("{}", serde_json::to_string(survey)?);
+        say!("{}", serde_json::to_string(survey)?);
         return Ok(());
     }
     let Survey { spec, ever, .. } = survey;
-    println!("run       {}, task {}", spec.run, spec.task);
+    say!("run       {}, task {}", spec.run, spec.task);
     let columns = spec.columns.iter().map(|column| format!("{} {}", column.name, column.width));
-    println!("columns   {}", columns.collect::<Vec<_>>().join(", "));
-    println!(
+    say!("columns   {}", columns.collect::<Vec<_>>().join(", "));
+    say!(
         "holds     {} transitions ({} env steps) in {} segments, {} ends of episodes",
-        survey.transitions, survey.env_steps, survey.segments, survey.episodes
+        survey.transitions,
+        survey.env_steps,
+        survey.segments,
+        survey.episodes
     );
-    println!(
+    say!(
         "ever      {} transitions ({} env steps) in {} segments, {} episodes",
-        ever.transitions, ever.env_steps, ever.segments, ever.episodes
+        ever.transitions,
+        ever.env_steps,
+        ever.segments,
+        ever.episodes
     );
-    println!(
-        "sampled   {}",
-        survey.sampled.map_or_else(|| "unknown".to_owned(), |n| format!("{n} transitions"))
-    );
-    println!("writers   {}", survey.writers.len());
-    println!(
+    say!("sampled   {}", survey.sampled.map_or_else(|| "unknown".to_owned(), |n| format!("{n} transitions")));
+    say!("writers   {}", survey.writers.len());
+    say!(
         "space     {:.1} MB on disk in {} files, for {:.1} MB of values",
         survey.disk_bytes as f64 / 1e6,
         survey.files,
         survey.value_bytes as f64 / 1e6
     );
     for damage in &survey.damages {
-        println!("damage    {damage}");
+        say!("damage    {damage}");
     }
     if survey.damages.is_empty() {
-        println!("whole     every segment passes its checks");
+        say!("whole     every segment passes its checks");
     }
     Ok(())
 }
 
 fn print_rewritten(rewritten: &Rewritten, json: bool) -> Result<()> {
     if json {
-        println!("{}", serde_json::to_string(rewritten)?);
+        say!("{}", serde_json::to_string(rewritten)?);
         return Ok(());
     }
     let Rewritten { found, segments, transitions, old } = rewritten;
     for damage in &found.damages {
-        println!("damage    {damage}");
+        say!("damage    {damage}");
     }
     let left_out = found.segments - segments;
     match old {
         Some(old) => {
-            println!("kept      {transitions} transitions in {segments} segments: all that are whole");
+            say!("kept      {transitions} transitions in {segments} segments: all that are whole");
             if left_out > 0 {
-                println!("dropped   {left_out} segments that were there twice");
+                say!("dropped   {left_out} segments that were there twice");
             }
-            println!("old files {}", old.display());
+            say!("old files {}", old.display());
         }
         None if left_out > 0 => {
-            println!(
+            say!(
                 "kept      the newest {transitions} transitions, in {segments} segments; dropped {left_out} segments"
             );
         }
         None => {
-            println!("kept      all {transitions} transitions, in {segments} segments: the store is whole")
+            say!("kept      all {transitions} transitions, in {segments} segments: the store is whole")
         }
     }
     Ok(())
@@ -225,12 +228,12 @@ fn export(dir: &Path, format: Format, output: Option<PathBuf>, id: Option<String
     bar.finish_and_clear();
     let Exported { transitions, episodes, unfinished } = exported;
     if json {
-        println!(
+        say!(
             "{}",
             json!({"path": path, "transitions": transitions, "episodes": episodes, "unfinished": unfinished})
         );
     } else {
-        println!(
+        say!(
             "{}: {transitions} transitions of {episodes} episodes, {unfinished} of them without their end",
             path.display()
         );
@@ -275,9 +278,9 @@ async fn snapshot_of(endpoint: &Endpoint, name: &str, table: &str, json: bool) -
     if json {
         let (paused, seconds) = (taken.paused_seconds, taken.seconds);
         let counted = json!({"path": taken.path, "paused_seconds": paused, "seconds": seconds, "transitions": transitions});
-        println!("{counted}");
+        say!("{counted}");
     } else {
-        println!(
+        say!(
             "{}: {transitions} transitions ever stored, copied in {:.2} s; appends waited {:.1} ms",
             taken.path,
             taken.seconds,

@@ -57,7 +57,7 @@ pub enum SecurityError {
 
 /// An address that is none.
 #[derive(Debug, Error)]
-#[error("{address:?} is not the address of a service: write it like replay:7400 ({reason})")]
+#[error("{address:?} is not the address of a service: write it like replay:7401 ({reason})")]
 pub struct AddressError {
     pub(crate) address: String,
     pub(crate) reason: String,

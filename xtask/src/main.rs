@@ -35,8 +35,8 @@ enum Command {
     },
     /// Set up what is missing, build, and run `getup train` with ARGS.
     Train {
-        /// Arguments of `getup train`, after `--`; `-- --help` lists them.
-        #[arg(last = true)]
+        /// Arguments of `getup train`; `-- --help` lists them.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         args: Vec<String>,
     },
     /// Set up what is missing and run the tests in their short form; where a Docker engine is present also on a cluster of

@@ -110,6 +110,6 @@ async fn an_address_that_is_none_is_refused_before_any_connection() {
         let identity = Identity::new("actor", 0);
         let refused = GrpcReplay::new(address, spec(), identity, waits.clone()).err();
         let message = refused.expect(address).to_string();
-        assert!(message.contains("write it like replay:7400"), "{message}");
+        assert!(message.contains("write it like replay:7401"), "{message}");
     }
 }

@@ -49,7 +49,7 @@ impl Sac {
     /// Puts another run's actor in the place of the untrained one, with the statistics that it learned under.
     pub(crate) fn begin_with(&mut self, policy: &Policy) -> Result<(), ActorMismatch> {
         if policy.shape != self.actor.shape {
-            let [found, wanted] = [&policy.shape, &self.actor.shape].map(|shape| format!("{shape:?}"));
+            let [found, wanted] = [&policy.shape, &self.actor.shape].map(ToString::to_string);
             return Err(ActorMismatch { of: "model", what: "shape", found, wanted });
         }
         self.check_normalizes("model", policy.statistics.is_some())?;
