@@ -100,7 +100,9 @@ class Run:
 
     @property
     def label(self):
-        return f"{self.family}, seed {self.seed}" if self.family != "standing" else self.name
+        """The name, which mostly ends with the seed, as in the table."""
+        named = self.family == "standing" or self.name.endswith(f"-{self.seed}")
+        return self.name if named else f"{self.name}, seed {self.seed}"
 
     def column(self, field):
         """One field of every evaluation."""
