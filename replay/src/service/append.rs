@@ -1,11 +1,10 @@
 //! A writer's stream: segments in, acknowledgements out.
 
 use super::committer::Job;
+use super::visit::Visit;
 use super::{failed, shutting_down};
-use crate::store::Store;
 use getup_proto::{Segment, SegmentError, SegmentTrace, v1};
 use getup_telemetry::Shutdown;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::SystemTime;
 use tokio::sync::{mpsc, oneshot, watch};
@@ -19,26 +18,6 @@ pub(super) struct AppendStream {
     jobs: mpsc::Sender<Job>,
     /// Durable before this stream.
     durable: u64,
-}
-
-/// A writer's presence at the store; ends when dropped.
-pub(super) struct Visit {
-    store: Arc<Store>,
-    writer: u64,
-}
-
-impl Visit {
-    /// Introduces the writer; how far its segments are durable.
-    pub(super) fn begin(store: Arc<Store>, writer: u64, name: &str) -> (Self, u64) {
-        let durable = store.introduce(writer, name);
-        (Self { store, writer }, durable)
-    }
-}
-
-impl Drop for Visit {
-    fn drop(&mut self) {
-        self.store.farewell(self.writer);
-    }
 }
 
 impl AppendStream {

@@ -2,8 +2,8 @@
 //!
 //! While the disk takes one group, the next gathers in the queue: the busier the service, the larger its commits.
 
-use super::append::Visit;
 use super::blocking::blocking;
+use super::visit::Visit;
 use crate::error::StoreError;
 use crate::gate::Permit;
 use crate::store::Store;

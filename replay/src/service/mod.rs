@@ -8,6 +8,7 @@ mod append;
 mod blocking;
 mod committer;
 mod sample;
+mod visit;
 
 use crate::config::DEFAULT_TABLE;
 use crate::error::StoreError;
