@@ -42,6 +42,8 @@ const REVERB_REQUIREMENTS: &[&str] =
 /// Python 3.11 and later) and Kubernetes.
 const READER_REQUIREMENTS: &[&str] = &[
     "minari[arrow]==0.5.4",
+    // Minari's Arrow reader imports it.
+    "pillow==12.0.0",
     "numpy==2.2.6",
     "check-jsonschema==0.39.0",
     "grafana-foundation-sdk==1769699379!11.6.0; python_version >= '3.11'",
