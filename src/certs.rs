@@ -36,6 +36,11 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
     let vault = arguments.authority.as_ref().unwrap_or(dir);
     let issued = make_authority(dir, vault, &arguments.names, arguments.if_missing)?;
     let shown = dir.display();
+    let token = dir.join("token");
+    let makes_token = arguments.token && !token.exists();
+    if makes_token {
+        write_secret(dir, &token).with_context(|| format!("cannot write {}", token.display()))?;
+    }
     say!(
         "{}",
         match issued {
@@ -44,9 +49,7 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
             Issued::AuthorityAndPeer => format!("{shown}/ca.pem and {shown}/peer.pem are new"),
         }
     );
-    let token = dir.join("token");
-    if arguments.token && !token.exists() {
-        write_secret(dir, &token).with_context(|| format!("cannot write {}", token.display()))?;
+    if makes_token {
         say!("{} is new", token.display());
     }
     Ok(())

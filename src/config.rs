@@ -274,7 +274,7 @@ impl Config {
         );
         ensure!(
             !self.run.contains('/') && self.run != "." && self.run != "..",
-            "run = {:?}: a name without a `/`; --run says where its folder is",
+            "run = {:?}: a name without a `/`; `getup train` and `getup learner` take its folder by --run",
             self.run
         );
         Ok(())

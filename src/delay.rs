@@ -1,6 +1,7 @@
 //! `getup delay`: a TCP proxy that holds up what passes, for faults of tests and of `getup chaos` where the kernel has no
 //! such network.
 
+use std::io::Write as _;
 use std::num::NonZeroU32;
 use std::time::Duration;
 
@@ -64,7 +65,8 @@ async fn serve(listener: TcpListener, target: &str, slowness: Slowness) -> Resul
         tokio::spawn(async move {
             let ended = pass_on(client, &target, slowness).await;
             let how = ended.map_or_else(|error| error.to_string(), |()| "both sides ended it".to_owned());
-            say!("{address} to {target}: {how}");
+            // Whoever read it may have gone; the other connections have not.
+            let _ = writeln!(std::io::stdout(), "{address} to {target}: {how}");
         });
     }
 }

@@ -86,14 +86,15 @@ pub(crate) fn run(arguments: Args) -> Result<()> {
         None => (evaluator.evaluate(&policy, beta, &seeds, progress)?, None),
     };
     bar.finish_and_clear();
+    // Written before anything is printed, whose reader may go; reported after it, so that a failure costs no report.
+    let written = recorded.map(|(path, file)| write_file(path, file.to_json()).map(|()| path)).transpose();
     let report = summarize(&episodes, beta, task.character, arguments.seed);
     if arguments.json {
         say!("{}", serde_json::to_string(&report).context("the report is not expressible as JSON")?);
     } else {
         print_report(&report);
     }
-    if let Some((path, file)) = recorded {
-        write_file(path, file.to_json())?;
+    if let Some(path) = written? {
         eprintln!("Episodes written to {}", path.display());
         let failed = episodes.iter().filter(|episode| episode.head_heights.is_empty()).count();
         if failed > 0 {

@@ -17,12 +17,15 @@ macro_rules! say {
 }
 pub(crate) use say;
 
-/// Prints a line. Where its reader has seen enough, as `head` has, the command is over; it ends with an error where the line
-/// cannot be written for another reason.
+/// How a program ends that SIGPIPE ended.
+const READER_HAS_GONE: i32 = 128 + 13;
+
+/// Prints a line. Where its reader has seen enough, as `head` has, the command is over, in silence; it ends with an error where
+/// the line cannot be written for another reason.
 pub(crate) fn print_line(line: fmt::Arguments<'_>) {
     match writeln!(io::stdout(), "{line}") {
         Ok(()) => {}
-        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => process::exit(0),
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => process::exit(READER_HAS_GONE),
         Err(error) => {
             eprintln!("error: cannot write to stdout: {error}");
             process::exit(1)

@@ -10,7 +10,7 @@ use anyhow::{Context, Result, bail, ensure};
 use getup_actor::identity::Identity;
 use getup_actor::worker;
 use getup_learner::curriculum::Outcome;
-use getup_learner::device;
+use getup_learner::device::{self, Device};
 use getup_learner::run_folder::RunFolder;
 use getup_learner::trainer::{Ending, Start};
 use getup_replay::{LocalSource, ReplayMetrics, Store};
@@ -59,19 +59,22 @@ pub(crate) struct Args {
 
 pub(crate) fn run(mut arguments: Args) -> Result<()> {
     let (config, folder) = prepare(&mut arguments)?;
+    let role = Role::new("train", &config, arguments.log_format)?;
+    // Before all else that libtorch does. Sums over threads depend on their number.
+    let threads = if arguments.deterministic { 1 } else { config.learner.effective_threads() };
+    let device = device::open(config.learner.device, threads)?;
     let beginning = arguments.from.as_deref().map(|path| load_beginning(&config, path)).transpose()?;
     let start = match (&beginning, arguments.resume) {
         (Some(beginning), _) => Start::From(beginning),
         (None, true) => Start::Newest,
         (None, false) => Start::Untrained,
     };
-    let role = Role::new("train", &config, arguments.log_format)?;
     let ending = if arguments.deterministic {
         role.run(async {
-            tokio::task::block_in_place(|| deterministic::train(&config, &role, &folder, start))
+            tokio::task::block_in_place(|| deterministic::train(&config, &role, &folder, device, start))
         })
     } else {
-        role.run(train(&config, &role, &folder, start))
+        role.run(train(&config, &role, &folder, device, start))
     }?;
     conclude(ending, &folder);
     Ok(())
@@ -146,8 +149,13 @@ fn name_after_folder(config: &mut Config, path: &Path) {
     }
 }
 
-async fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_>) -> Result<Ending> {
-    let device = device::open(config.learner.device, config.learner.effective_threads())?;
+async fn train(
+    config: &Config,
+    role: &Role,
+    folder: &RunFolder,
+    device: Device,
+    start: Start<'_>,
+) -> Result<Ending> {
     serve_metrics(config, role).await?;
     let spec = config.run_spec()?;
     folder.create()?;

@@ -15,7 +15,7 @@ use getup_actor::link::{Heartbeat, Lease, PolicyUpdate};
 use getup_actor::metrics::ActorMetrics;
 use getup_actor::sending::Sending;
 use getup_learner::config::LearnerConfig;
-use getup_learner::device;
+use getup_learner::device::Device;
 use getup_learner::hub::Hub;
 use getup_learner::run_folder::RunFolder;
 use getup_learner::trainer::{Ending, Start, Trainer};
@@ -32,11 +32,16 @@ use crate::config::Config;
 use crate::role::Role;
 use crate::run::{make_hub, make_trainer, note_config, sample_options};
 
-pub(super) fn train(config: &Config, role: &Role, folder: &RunFolder, start: Start<'_>) -> Result<Ending> {
+pub(super) fn train(
+    config: &Config,
+    role: &Role,
+    folder: &RunFolder,
+    device: Device,
+    start: Start<'_>,
+) -> Result<Ending> {
     // Sums over threads depend on their number. What is noted of the run is what was asked for.
     let learner = LearnerConfig { threads: 1, ..config.learner.clone() };
     let (noted, config) = (config, &Config { learner, ..config.clone() });
-    let device = device::open(config.learner.device, 1)?;
     folder.create()?;
     let _lock = folder.lock()?;
     let store = open_store(config, role, folder)?;
